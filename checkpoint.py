@@ -1,0 +1,74 @@
+"""Files that last: saved whole or not at all, and read without ever running what is inside them.
+
+Two kinds, both of torch.save, both dictionaries of plain values and tensors:
+    policy.pt      the policy's weights and what they are for (robot, task, policy, steps, seed); about 2 MB. This is
+                   what evaluate.py reads and what checkpoints/ holds.
+    checkpoint.pt  the same and everything else that training needs to go on: `train.py --resume`.
+
+    >>> policy, card = load_policy("checkpoints/a1-stiffness-rolt.pt")
+"""
+
+import os
+from pathlib import Path
+
+import torch
+
+from rolt import POLICIES, make_policy
+from robots import ROBOTS
+
+FORMAT = 1  # raise it when files of before can no longer be read
+CARD = ("robot", "task", "policy", "steps", "seed")  # what a policy file says about itself
+
+
+class CheckpointError(ValueError):
+    """The file cannot be used; the message says why and what would help."""
+
+
+def save(content: dict, path: Path) -> None:
+    """Writes to a temporary file beside `path`, then renames it: a crash or a full disk leaves the old file whole."""
+    temporary = path.with_name(path.name + ".tmp")
+    try:
+        with open(temporary, "wb") as file:
+            torch.save(content | {"format": FORMAT}, file)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(temporary, path)
+    except (OSError, RuntimeError) as error:  # torch.save reports a full disk as a RuntimeError
+        temporary.unlink(missing_ok=True)
+        raise OSError(f"cannot write {path}: {error}; what was saved there before is untouched") from error
+
+
+def load(path: str | Path) -> dict:
+    """The dictionary in the file. CheckpointError if it is missing, damaged or of another format."""
+    path = Path(path)
+    if not path.is_file():
+        raise CheckpointError(f"there is no checkpoint {path}")
+    try:
+        content = torch.load(path, map_location="cpu", weights_only=True)
+    except Exception as error:  # whatever damaged bytes provoke in zip, pickle or torch
+        raise CheckpointError(f"{path} is not a whole checkpoint ({type(error).__name__}): copy or train it again") from error
+    if not isinstance(content, dict) or content.get("format") != FORMAT:
+        raise CheckpointError(f"{path} is not a checkpoint of this version (format {FORMAT}): train it again")
+    return content
+
+
+def load_policy(path: str | Path, robot: str | None = None) -> tuple[torch.nn.Module, dict]:
+    """The policy in a policy.pt or checkpoint.pt, ready to act, and its card (`CARD`).
+
+    robot: if given, the one it must be for. Raises CheckpointError if the file cannot be used.
+    """
+    content = load(path)
+    missing = [key for key in (*CARD, "weights") if key not in content]
+    if missing:
+        raise CheckpointError(f"{path} holds no policy: {', '.join(missing)} is missing")
+    card = {key: content[key] for key in CARD}
+    if card["robot"] not in ROBOTS or card["policy"] not in POLICIES:
+        raise CheckpointError(f"{path} is of a robot or policy unknown here: {card['robot']}, {card['policy']}")
+    if robot is not None and card["robot"] != robot:
+        raise CheckpointError(f"{path} was trained on the {card['robot']}, not on the {robot}")
+    policy = make_policy(card["policy"], ROBOTS[card["robot"]])
+    try:
+        policy.load_state_dict(content["weights"])
+    except (RuntimeError, TypeError, AttributeError) as error:
+        raise CheckpointError(f"the weights in {path} do not fit the policy {card['policy']}: train it again") from error
+    return policy.eval(), card

@@ -1,0 +1,322 @@
+"""N legged robots in MuJoCo, each with a fault of its own, behind the interface of a Gymnasium vector env.
+
+The simulator is `mujoco.batch.Batch`; this file adds what the paper's section III and legged_gym define around it:
+observations, commands, resets, pushes, terminations. Rewards are in rewards.py, faults in faults.py.
+
+Legend: N robots, L legs, J joints a leg, H = 10 steps of history. Numpy, float32 out.
+
+What a policy sees (`Observation`); scales are legged_gym's:
+
+    symbol     shape            meaning                                                            scale
+    legs       (N, L, H, 21)    s^l of eq. 1: what each leg saw in the past 10 steps, oldest first
+      0:3                       joint position - default pose, hip thigh calf [rad]                1
+      3:6                       joint velocity [rad/s]                                             0.05
+      6:9                       previous action of the leg's joints                                1
+      9:12                      velocity command forward, left [m/s], yaw [rad/s]                  2, 2, 0.25
+      12:15                     trunk linear velocity in the trunk's frame [m/s]                   2
+      15:18                     trunk angular velocity in the trunk's frame [rad/s]                0.25
+      18:21                     direction of gravity in the trunk's frame                          1
+    action     (N, L*J)         a_{t-1} of eq. 2, the previous action of all joints                1
+    heights    (N, 16, 12)      s_e: clip(trunk z - 0.5 m - ground z, -1, 1) at points 0.1 m       5
+                                apart around the robot, rows forward, columns left, turning with
+                                its yaw (the ground is flat so far)
+
+What rewards and users may read after a step (attributes of the env):
+
+    command (N, 3), linear_velocity (N, 3), angular_velocity (N, 3), gravity (N, 3): as above, unscaled
+    joint_error, joint_velocity, torque, action, last_action (N, L, J): rad, rad/s, N m, -, -
+    link_contact (N, L*links with a capsule), foot_contact, touchdown (N, L) bool; air_time (N, L) s
+    position (N, 3) m, yaw (N,) rad: the trunk in the world
+
+    >>> env = LocomotionEnv("a1", num_envs=4)
+    >>> observation = env.reset()
+    >>> observation, reward, terminated, truncated, info = env.step(np.zeros((4, env.num_actions)))
+"""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import mujoco
+import numpy as np
+from mujoco.batch import Batch
+
+from faults import Fault, healthy, write_fault
+from rewards import total_reward
+from robots import PHYSICS_DT, ROBOTS, Robot, build_model
+
+SUBSTEPS = 4  # legged_gym: 50 Hz control
+CONTROL_DT = SUBSTEPS * PHYSICS_DT  # s
+HISTORY = 10  # steps (paper, section III-A)
+SCAN_SHAPE = (16, 12)  # points forward, left; 12 patches of 4 x 4 (the paper gives 12 patches, the points are ours)
+MAX_ACTION = 10.0  # ours: 2.5 rad from the default pose reaches every joint limit
+MAX_TILT = np.cos(np.deg2rad(60))  # ours: past 60 degrees no robot here gets up again; legged_gym waits for contact
+SAVED_ARRAYS = (
+    "action", "last_action", "history", "command", "heading", "air_time", "age", "episode_return", "fault_index",
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class EnvConfig:
+    """Everything random about an episode. Ranges are (low, high), uniform."""
+
+    episode_seconds: float = 20.0  # legged_gym, and the paper's tests
+    command_seconds: float = 10.0  # legged_gym: then a new command
+    forward_speed: tuple[float, float] = (0.0, 1.0)  # m/s; ours: the tests walk forward (legged_gym: -1 to 1)
+    lateral_speed: tuple[float, float] = (0.0, 0.0)  # m/s; ours, likewise
+    heading: tuple[float, float] = (-np.pi, np.pi)  # rad, legged_gym's heading mode
+    friction: tuple[float, float] = (0.5, 1.25)  # legged_gym
+    start_pose: tuple[float, float] = (0.5, 1.5)  # times the default joint angles, legged_gym
+    start_speed: float = 0.5  # m/s and rad/s, each component of the trunk's velocity within +-, legged_gym
+    push_seconds: float = 15.0  # legged_gym: then the trunk's velocity is redrawn
+    push_speed: float = 1.0  # m/s, x and y within +-, legged_gym; 0 = no pushes
+
+
+class Observation(NamedTuple):
+    """See the table at the head of this file. Fields are arrays here and tensors in the learner."""
+
+    legs: np.ndarray  # (N, L, H, 21)
+    action: np.ndarray  # (N, L*J)
+    heights: np.ndarray  # (N, 16, 12)
+
+
+class LocomotionEnv:
+    """N robots of one kind; robot i's episode ends, and is restarted by `step`, on its own.
+
+    faults: (probability, fault) pairs; each reset draws one. `pin_faults` fixes one a robot instead.
+    num_threads: of the simulator, 0 = one a core. Results do not depend on it.
+    """
+
+    def __init__(
+        self,
+        robot: str | Robot,
+        num_envs: int,
+        seed: int | tuple[int, ...] = 0,
+        num_threads: int = 0,
+        faults: tuple[tuple[float, Fault], ...] = ((1.0, healthy()),),
+        config: EnvConfig = EnvConfig(),
+    ):
+        if isinstance(robot, str) and robot not in ROBOTS:
+            raise ValueError(f"unknown robot {robot!r}; there is {', '.join(ROBOTS)}")
+        if num_envs < 1:
+            raise ValueError(f"num_envs is at least 1, not {num_envs}")
+        self.robot = robot = ROBOTS[robot] if isinstance(robot, str) else robot
+        self.num_envs, self.config = num_envs, config
+        self.num_legs, self.num_joints = len(robot.legs), len(robot.links)
+        self.num_actions = self.num_legs * self.num_joints
+        self.episode_steps = round(config.episode_seconds / CONTROL_DT)
+        self.rng = np.random.default_rng(seed)
+
+        self.model = build_model(robot)
+        self.world = Batch(self.model, nsim=num_envs, nthread=num_threads, persistent=True)
+        self._qpos, self._qvel, self._ctrl = (self.world.bind(name) for name in ("qpos", "qvel", "ctrl"))
+        self._torque, self._contacts = self.world.bind("actuator_force"), self.world.bind("sensordata")
+        self._friction = self.world.expand("geom_friction")
+        names = [self.model.sensor(i).name.removeprefix("contact_") for i in range(self.model.nsensor)]
+        self._trunk_sensor = [names.index("trunk")]
+        self._foot_sensors = [names.index(f"{leg}_foot") for leg in robot.legs]
+        self._link_sensors = [i for i, name in enumerate(names) if name in robot.joints]
+
+        self._default = np.array(robot.default_pose)  # (L, J)
+        self._limits = np.array([link.limits for link in robot.links])  # (J, 2)
+        self.faults = [fault for _, fault in faults]
+        self._fault_odds = np.array([probability for probability, _ in faults])
+        self._pinned = False
+        self.fault_index = np.zeros(num_envs, dtype=int)  # (N,) which of `faults` each robot has
+
+        shape = (num_envs, self.num_legs, self.num_joints)
+        self.action, self.last_action = np.zeros(shape), np.zeros(shape)
+        self.history = np.zeros((num_envs, self.num_legs, HISTORY, 12 + 3 * self.num_joints), dtype=np.float32)
+        self.command, self.heading = np.zeros((num_envs, 3)), np.zeros(num_envs)
+        self.air_time = np.zeros((num_envs, self.num_legs))
+        self.age = np.zeros(num_envs, dtype=int)  # (N,) steps since reset
+        self.episode_return = np.zeros(num_envs)
+        self.divergences = 0  # simulations that MuJoCo gave up, in total
+
+    # ------------------------------------------------------------------ interface
+
+    def pin_faults(self, faults: list[Fault]) -> None:
+        """Robot i has faults[i] from its next reset on, in every episode (for tests: one a robot)."""
+        if len(faults) != self.num_envs:
+            raise ValueError(f"{len(faults)} faults for {self.num_envs} robots")
+        self.faults, self.fault_index, self._pinned = list(faults), np.arange(self.num_envs), True
+
+    def reset(self, random_ages: bool = False) -> Observation:
+        """Starts an episode on every robot. `random_ages` spreads their ends in time (legged_gym, for training)."""
+        self._reset(np.arange(self.num_envs))
+        if random_ages:
+            self.age[:] = self.rng.integers(self.episode_steps, size=self.num_envs)
+        return self.observe()
+
+    def step(self, action: np.ndarray) -> tuple[Observation, np.ndarray, np.ndarray, np.ndarray, dict]:
+        """One control step of 20 ms: the joint targets are default pose + action_scale * action.
+
+        Args:
+            action: (N, L*J), clipped to +-10.
+        Returns:
+            observation: Observation; of a robot whose episode ended, the first one of its next episode.
+            reward: (N,) float32.
+            terminated: (N,) bool, the robot fell (trunk on the ground, tilt over 60 degrees) or its simulation
+                diverged.
+            truncated: (N,) bool, the time was up.
+            info: of the state that the step led to, before any reset: "rewards" {term: (N,)} weighted, per second,
+                "position" (N, 3) m, "speed" and "commanded_speed" forward (N,) m/s, "diverged" (N,) bool. Of time-outs:
+                "truncated_ids" (n,) and "final_observation" (n rows), the true last observations to bootstrap from.
+                Of all n finished episodes: "episode_returns" and "episode_lengths" (n,), in steps.
+        """
+        action = np.asarray(action, dtype=np.float64).reshape(self.action.shape)
+        if not np.isfinite(action).all():
+            raise ValueError("an action is not finite: the policy that made it has diverged")
+        self.last_action, self.action = self.action, np.clip(action, -MAX_ACTION, MAX_ACTION)
+        self._ctrl[:] = (self._default + self.robot.action_scale * self.action).reshape(self.num_envs, -1)
+        self.world.step(nstep=SUBSTEPS, stage=mujoco.mjtStage.mjSTAGE_VEL)
+        self.age += 1
+
+        diverged = self._diverged()
+        self._read_state()
+        self._read_feet()
+        reward, terms = total_reward(self, CONTROL_DT)
+        reward[diverged] = 0.0
+        self.episode_return += reward
+        fallen = (self._contacts[:, self._trunk_sensor] > 0).any(axis=1) | (self.gravity[:, 2] > -MAX_TILT)
+        terminated = fallen | diverged
+        truncated = (self.age >= self.episode_steps) & ~terminated
+        self.air_time *= ~self.foot_contact
+        info = {"rewards": terms, "position": self.position, "diverged": diverged}
+        info["speed"], info["commanded_speed"] = self.linear_velocity[:, 0], self.command[:, 0].copy()
+
+        self._push()
+        self._resample_commands(np.flatnonzero(self.age % round(self.config.command_seconds / CONTROL_DT) == 0))
+        self._steer()
+        self._remember()
+
+        ended = np.flatnonzero(terminated | truncated)
+        info["truncated_ids"] = np.flatnonzero(truncated)
+        info["final_observation"] = Observation(*(field[truncated] for field in self.observe()))
+        info["episode_returns"], info["episode_lengths"] = self.episode_return[ended].copy(), self.age[ended].copy()
+        if len(ended):
+            self._reset(ended)
+        return self.observe(), reward.astype(np.float32), terminated, truncated, info
+
+    def observe(self) -> Observation:
+        """The current observation (a copy)."""
+        action = self.action.reshape(self.num_envs, -1).astype(np.float32)
+        return Observation(self.history.copy(), action, self._scan())
+
+    # ------------------------------------------------------------------ episode
+
+    def _reset(self, ids: np.ndarray) -> None:
+        """New episodes for the robots `ids`: pose, velocity, friction, fault, command."""
+        config, n = self.config, len(ids)
+        self.world.reset(ids, keyframe=0, stage=mujoco.mjtStage.mjSTAGE_NONE)
+        if not self._pinned:
+            self.fault_index[ids] = self.rng.choice(len(self.faults), size=n, p=self._fault_odds)
+        pose = self._default * self.rng.uniform(*config.start_pose, size=(n, self.num_legs, self.num_joints))
+        pose = np.clip(pose, self._limits[:, 0], self._limits[:, 1]).reshape(n, -1)
+        velocity = self.rng.uniform(-config.start_speed, config.start_speed, size=(n, 6))
+        self._friction[ids, :, 0] = self.rng.uniform(*config.friction, size=(n, 1))
+        for index in np.unique(self.fault_index[ids]):
+            chosen = self.fault_index[ids] == index
+            write_fault(self.faults[index], self.robot, self.world, ids[chosen])
+        locked = self.world.bind("eq_active")[ids] > 0
+        self._qpos[ids, 7:] = np.where(locked, self._default.reshape(-1), pose)
+        self._qvel[ids, :6] = velocity
+        self.world.forward(ids, stage=mujoco.mjtStage.mjSTAGE_VEL)
+
+        self.action[ids] = self.last_action[ids] = 0.0
+        self.air_time[ids] = 0.0
+        self.age[ids] = 0
+        self.episode_return[ids] = 0.0
+        self._read_state()
+        self._resample_commands(ids)
+        self._steer()
+        self.history[ids] = self._frame()[ids, :, None]  # as though it had stood like this for the past 10 steps
+
+    def _resample_commands(self, ids: np.ndarray) -> None:
+        n = len(ids)
+        self.command[ids, 0] = self.rng.uniform(*self.config.forward_speed, size=n)
+        self.command[ids, 1] = self.rng.uniform(*self.config.lateral_speed, size=n)
+        self.heading[ids] = self.rng.uniform(*self.config.heading, size=n)
+
+    def _steer(self) -> None:
+        """The yaw command turns the robot towards its heading (legged_gym's heading mode)."""
+        error = (self.heading - self.yaw + np.pi) % (2 * np.pi) - np.pi
+        self.command[:, 2] = np.clip(0.5 * error, -1.0, 1.0)
+
+    def _push(self) -> None:
+        due = self.age % round(self.config.push_seconds / CONTROL_DT) == 0
+        if self.config.push_speed > 0 and due.any():
+            speed = self.config.push_speed
+            self._qvel[due, :2] = self.rng.uniform(-speed, speed, size=(int(due.sum()), 2))
+
+    def _diverged(self) -> np.ndarray:
+        """(N,) bool, simulations that MuJoCo reset by itself because their numbers ran away."""
+        warning = mujoco.mjtWarning
+        bad = [int(w) for w in (warning.mjWARN_BADQPOS, warning.mjWARN_BADQVEL, warning.mjWARN_BADQACC)]
+        diverged = (self.world.warning[:, bad, 1] > 0).any(axis=1)
+        self.divergences += int(diverged.sum())
+        return diverged
+
+    # ------------------------------------------------------------------ going on after a break
+
+    def state_dict(self) -> dict:
+        """All that the next step depends on (arrays, lists and numbers)."""
+        arrays = {name: getattr(self, name).copy() for name in SAVED_ARRAYS}
+        world = {"state": self.world.state.copy(), "friction": self._friction.copy()}
+        return arrays | world | {"random": self.rng.bit_generator.state, "divergences": self.divergences}
+
+    def load_state_dict(self, state: dict) -> None:
+        """The inverse of `state_dict`, for an env made with the same arguments."""
+        for name in SAVED_ARRAYS:
+            getattr(self, name)[...] = state[name]
+        self.rng.bit_generator.state, self.divergences = state["random"], state["divergences"]
+        for index in np.unique(self.fault_index):
+            write_fault(self.faults[index], self.robot, self.world, np.flatnonzero(self.fault_index == index))
+        self._friction[...] = state["friction"]
+        self.world.state[...] = state["state"]
+        self.world.forward(stage=mujoco.mjtStage.mjSTAGE_VEL)
+        self._read_state()
+
+    # ------------------------------------------------------------------ state
+
+    def _read_state(self) -> None:
+        """MuJoCo's state in the terms of the table above. A free joint's velocity is linear in the world's frame,
+        angular in the body's."""
+        shape = self.action.shape
+        w, x, y, z = self._qpos[:, 3:7].T
+        self.position = self._qpos[:, :3].copy()
+        self.yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+        forward = np.stack([1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)], axis=1)
+        left = np.stack([2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)], axis=1)
+        up = np.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)], axis=1)
+        rotation = np.stack([forward, left, up], axis=1)  # (N, 3, 3), world -> trunk
+        self.linear_velocity = np.einsum("nij,nj->ni", rotation, self._qvel[:, :3])
+        self.angular_velocity = self._qvel[:, 3:6].copy()
+        self.gravity = -rotation[:, :, 2]
+        self.joint_error = self._qpos[:, 7:].reshape(shape) - self._default
+        self.joint_velocity = self._qvel[:, 6:].reshape(shape).copy()
+        self.torque = self._torque.reshape(shape)
+        self.link_contact = self._contacts[:, self._link_sensors] > 0
+
+    def _read_feet(self) -> None:
+        """A touchdown is a contact of a foot that was in the air one step ago."""
+        self.foot_contact = self._contacts[:, self._foot_sensors] > 0
+        self.touchdown = self.foot_contact & (self.air_time > 0)
+        self.air_time += CONTROL_DT
+
+    def _frame(self) -> np.ndarray:
+        """(N, L, 21), the newest step of every leg's history."""
+        body = np.concatenate(
+            [self.command * (2, 2, 0.25), self.linear_velocity * 2, self.angular_velocity * 0.25, self.gravity], axis=1
+        )  # (N, 12)
+        body = np.broadcast_to(body[:, None], (self.num_envs, self.num_legs, 12))
+        frame = np.concatenate([self.joint_error, self.joint_velocity * 0.05, self.action, body], axis=2)
+        return frame.astype(np.float32)
+
+    def _remember(self) -> None:
+        self.history[:, :, :-1] = self.history[:, :, 1:]
+        self.history[:, :, -1] = self._frame()
+
+    def _scan(self) -> np.ndarray:
+        """(N, 16, 12) scandots. On flat ground every point is at z = 0, whichever way the grid is turned."""
+        height = np.clip(self._qpos[:, 2] - 0.5, -1, 1) * 5
+        return np.broadcast_to(height.astype(np.float32)[:, None, None], (self.num_envs, *SCAN_SHAPE)).copy()

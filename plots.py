@@ -1,0 +1,66 @@
+"""Pictures of numbers: the learning curve of a run and the bar charts of the tests."""
+
+import csv
+from pathlib import Path
+
+import matplotlib
+
+matplotlib.use("Agg")  # files only: works without a display
+import matplotlib.pyplot as plt  # noqa: E402
+import numpy as np  # noqa: E402
+
+
+def learning_curve(progress: Path, picture: Path) -> None:
+    """Draws the run's progress.csv: return, speed against the command, episode length, sigma and KL over steps."""
+    with open(progress, newline="") as file:
+        rows = list(csv.DictReader(file))
+    column = {name: np.array([float(row[name]) for row in rows]) for name in rows[0]}
+    steps = column["steps"] / 1e6
+    figure, axes = plt.subplots(2, 2, figsize=(9, 5.5), sharex=True, layout="constrained")
+    panels = {
+        "return of an episode": ["episode_return"],
+        "forward speed [m/s]": ["speed", "commanded_speed"],
+        "length of an episode [s]": ["episode_seconds"],
+        "sigma of the actions, KL of an update": ["sigma", "kl"],
+    }
+    for axis, (title, names) in zip(axes.flat, panels.items()):
+        for name in names:
+            known = ~np.isnan(column[name])
+            axis.plot(steps[known], column[name][known], linewidth=1.2, label=name.replace("_", " "))
+        axis.set_title(title, fontsize=10)
+        axis.grid(alpha=0.3)
+        if len(names) > 1:
+            axis.legend(fontsize=8, frameon=False)
+    for axis in axes[1]:
+        axis.set_xlabel("env steps [million]")
+    save_figure(figure, picture)
+
+
+def bar_charts(
+    panels: dict[str, dict[str, tuple[np.ndarray, np.ndarray]]], cases: list[str], picture: Path, title: str
+) -> None:
+    """One panel a quantity, one group of bars a case, one bar a method.
+
+    panels: {axis label: {method: (means, standard deviations), each in the order of `cases`}}.
+    """
+    figure, axes = plt.subplots(1, len(panels), figsize=(5.2 * len(panels), 3.8), layout="constrained", squeeze=False)
+    for axis, (label, methods) in zip(axes[0], panels.items()):
+        width = 0.8 / len(methods)
+        for i, (method, (mean, deviation)) in enumerate(methods.items()):
+            x = np.arange(len(cases)) + (i - (len(methods) - 1) / 2) * width
+            axis.bar(x, mean, width, yerr=deviation, capsize=2, label=method, error_kw={"linewidth": 0.8})
+        axis.set_xticks(np.arange(len(cases)), cases, fontsize=8)
+        axis.set_ylabel(label)
+        axis.set_ylim(bottom=min(0, axis.get_ylim()[0]))
+        axis.grid(axis="y", alpha=0.3)
+    axes[0, -1].legend(fontsize=8, frameon=False, loc="lower right")
+    figure.suptitle(title, fontsize=10)
+    save_figure(figure, picture)
+
+
+def save_figure(figure, picture: Path) -> None:
+    """Writes the picture whole or not at all."""
+    temporary = picture.with_name("." + picture.name)
+    figure.savefig(temporary, dpi=130, format="png")
+    temporary.replace(picture)
+    plt.close(figure)

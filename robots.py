@@ -1,0 +1,218 @@
+"""Robots as data, and the one function that turns a robot into a MuJoCo model.
+
+A robot is a trunk and L equal legs of J joints; nothing below knows more than that. A new robot is a new
+`Robot(...)` at the end of this file and an entry in `ROBOTS`. Only the front right leg is written down: left legs
+are its mirror image in y, rear legs in x where `Link.rear_mirrors_x` says so.
+
+What a fault (faults.py) will change on one robot is prepared here, so that a fault is only numbers:
+    joint lock      an inactive equality constraint a joint        -> eq_active, eq_data
+    motor strength  a position actuator a joint                    -> actuator_gainprm, _biasprm, _forcerange
+    friction        the robot's geoms decide it (priority 1)       -> geom_friction
+
+Legend: L legs, J joints a leg. Legs are ordered FR, FL, RR, RL (front/rear, right/left), joints hip, thigh, calf.
+
+    python robots.py            # prints every robot: masses, limits, standing height
+"""
+
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+
+PHYSICS_DT = 0.005  # s, legged_gym: 200 Hz physics, 4 substeps a control step of 50 Hz
+
+Vec3 = tuple[float, float, float]
+Inertia = tuple[float, float, float, float, float, float]  # Ixx, Iyy, Izz, Ixy, Ixz, Iyz
+
+
+@dataclass(frozen=True)
+class Link:
+    """One link of the front right leg and the joint that carries it."""
+
+    name: str
+    mass: float  # kg
+    com: Vec3  # m, centre of mass in the link's frame
+    inertia: Inertia  # kg m^2 about the centre of mass, link axes
+    offset: Vec3  # m, joint origin in the parent link's frame (the first link's are `Robot.mounts`)
+    axis: Vec3  # joint axis, right legs
+    axis_left: Vec3  # joint axis, left legs
+    limits: tuple[float, float]  # rad
+    effort: float  # N m, torque limit
+    capsule: tuple[float, Vec3, Vec3] | None  # collision shape: radius, start, end (m, link frame)
+    rear_mirrors_x: bool = False  # rear legs mirror this link in x as well
+
+
+@dataclass(frozen=True)
+class Robot:
+    """A trunk with L legs of J joints. Per-leg tables follow the order of `legs`."""
+
+    name: str
+    trunk_mass: float  # kg
+    trunk_com: Vec3  # m
+    trunk_inertia: Inertia  # kg m^2
+    trunk_box: Vec3  # m, full size of the collision box
+    legs: tuple[str, ...]
+    mounts: tuple[Vec3, ...]  # (L, 3) m, first joint of each leg in the trunk frame; y < 0 right, x < 0 rear
+    links: tuple[Link, ...]  # J links, from the trunk outwards
+    foot_position: Vec3  # m, centre of the foot sphere in the last link's frame
+    foot_radius: float  # m
+    default_pose: tuple[tuple[float, ...], ...]  # (L, J) rad, the pose of a zero action
+    start_height: float  # m, trunk above ground at reset
+    stiffness: float  # N m/rad, kp of the joint controller
+    damping: float  # N m s/rad, kd
+    action_scale: float  # rad of joint target per unit of action
+    armature: float  # kg m^2, reflected rotor inertia
+    friction_loss: float  # N m, dry friction of a joint
+
+    @property
+    def joints(self) -> list[str]:
+        """The L*J joint names, leg by leg: FR_hip, FR_thigh, FR_calf, FL_hip, ..."""
+        return [f"{leg}_{link.name}" for leg in self.legs for link in self.links]
+
+
+def build_model(robot: Robot) -> mujoco.MjModel:
+    """The robot on flat ground. Bodies and actuators in the order of `robot.joints`; keyframe 0 is the default pose.
+
+    Contacts are robot-ground only. Sensors `contact_<geom>` count the contacts of the trunk, of each link with a
+    capsule, and of each foot.
+    """
+    spec = mujoco.MjSpec()
+    spec.modelname = robot.name
+    spec.compiler.degree = False
+    spec.option.timestep = PHYSICS_DT
+    spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST  # takes the damping kd implicitly
+    spec.option.cone = mujoco.mjtCone.mjCONE_PYRAMIDAL
+    spec.option.iterations = 10  # Newton converges in 2 or 3; the bound keeps one odd robot from stalling the rest
+    spec.option.ls_iterations = 20
+
+    _add_world(spec)
+    trunk = spec.worldbody.add_body(name="trunk", pos=[0, 0, robot.start_height])
+    trunk.add_freejoint(name="root")
+    _set_inertia(trunk, robot.trunk_mass, robot.trunk_com, robot.trunk_inertia)
+    _add_geom(spec, trunk, "trunk", mujoco.mjtGeom.mjGEOM_BOX, np.array(robot.trunk_box) / 2)
+
+    for leg, mount, pose in zip(robot.legs, robot.mounts, robot.default_pose):
+        parent = trunk
+        for i, (link, angle) in enumerate(zip(robot.links, pose)):
+            left, rear = mount[1] > 0, mount[0] < 0
+            mirror = np.array([-1 if rear and link.rear_mirrors_x else 1, -1 if left else 1, 1])
+            name = f"{leg}_{link.name}"
+            body = parent.add_body(name=name, pos=mount if i == 0 else mirror * link.offset)
+            _set_inertia(body, link.mass, mirror * link.com, _mirror_inertia(link.inertia, mirror))
+            body.add_joint(
+                name=name, axis=link.axis_left if left else link.axis, range=link.limits, ref=0.0,
+                armature=robot.armature, frictionloss=robot.friction_loss,
+            )  # fmt: skip
+            if link.capsule is not None:
+                radius, start, end = link.capsule
+                fromto = np.concatenate([mirror * start, mirror * end])
+                _add_geom(spec, body, name, mujoco.mjtGeom.mjGEOM_CAPSULE, [radius, 0, 0], fromto=fromto)
+
+            motor = spec.add_actuator(name=name, target=name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
+            motor.set_to_position(kp=robot.stiffness, kv=robot.damping)
+            motor.forcerange = [-link.effort, link.effort]
+            lock = spec.add_equality(
+                name=name, type=mujoco.mjtEq.mjEQ_JOINT, name1=name, objtype=mujoco.mjtObj.mjOBJ_JOINT, active=False
+            )
+            lock.data[0] = angle  # the joint angle that the lock holds
+            lock.solref = [2 * PHYSICS_DT, 1]  # as stiff as the time step allows: within 0.01 rad under load
+            lock.solimp = [0.99, 0.9999, 0.001, 0.5, 2]
+            parent = body
+        foot = mirror * robot.foot_position
+        _add_geom(spec, body, f"{leg}_foot", mujoco.mjtGeom.mjGEOM_SPHERE, [robot.foot_radius, 0, 0], pos=foot)
+
+    spec.add_key(
+        name="default",
+        qpos=[0, 0, robot.start_height, 1, 0, 0, 0, *np.ravel(robot.default_pose)],
+        ctrl=np.ravel(robot.default_pose),
+    )
+    return spec.compile()
+
+
+def _add_world(spec: mujoco.MjSpec) -> None:
+    """Ground, light and a checkered material (for pictures)."""
+    spec.visual.global_.offwidth, spec.visual.global_.offheight = 1280, 720
+    spec.add_texture(
+        name="checker", type=mujoco.mjtTexture.mjTEXTURE_2D, builtin=mujoco.mjtBuiltin.mjBUILTIN_CHECKER,
+        rgb1=[0.86, 0.88, 0.90], rgb2=[0.78, 0.81, 0.84], width=256, height=256,
+    )  # fmt: skip
+    material = spec.add_material(name="ground", texrepeat=[1, 1], texuniform=True)
+    material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "checker"
+    spec.worldbody.add_light(pos=[0, 0, 4], dir=[0.2, 0.3, -1], type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL)
+    spec.worldbody.add_geom(
+        name="ground", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 0.05], material="ground", contype=1, conaffinity=0
+    )
+
+
+def _add_geom(spec: mujoco.MjSpec, body, name: str, kind, size, **where) -> None:
+    """A geom that touches the ground alone and decides the friction there, with a sensor that counts its contacts."""
+    foot = kind == mujoco.mjtGeom.mjGEOM_SPHERE
+    body.add_geom(
+        name=name, type=kind, size=size, contype=0, conaffinity=1, condim=3, priority=1, friction=[1, 0.005, 0.0001],
+        rgba=[0.15, 0.15, 0.17, 1] if foot else [0.35, 0.45, 0.60, 1], **where,
+    )  # fmt: skip
+    spec.add_sensor(
+        name=f"contact_{name}", type=mujoco.mjtSensor.mjSENS_CONTACT, objtype=mujoco.mjtObj.mjOBJ_GEOM, objname=name,
+        intprm=[1 << mujoco.mjtConDataField.mjCONDATA_FOUND.value, 0, 1],  # fields, reduction, slots
+    )  # fmt: skip
+
+
+def _set_inertia(body, mass: float, com, inertia) -> None:
+    body.mass, body.ipos, body.fullinertia, body.explicitinertial = mass, com, inertia, True
+
+
+def _mirror_inertia(inertia: Inertia, mirror: np.ndarray) -> np.ndarray:
+    """Products of inertia change sign with the axes they join; moments do not."""
+    x, y, z = mirror
+    return np.array(inertia) * [1, 1, 1, x * y, x * z, y * z]
+
+
+# Unitree A1, 12.45 kg. Source: mujoco_menagerie unitree_a1/a1.xml (masses, inertias, limits, armature, friction) and
+# legged_gym a1_config.py (pose, gains, action scale, start height). Thigh and calf boxes are capsules here: as
+# exact on steps and quicker. The hips, inside the trunk's outline, do not collide.
+_A1_THIGH_Y = -0.08505
+
+A1 = Robot(
+    name="a1",
+    trunk_mass=4.713,
+    trunk_com=(0, 0.0041, -0.0005),
+    trunk_inertia=(0.0158533, 0.0377999, 0.0456542, -3.66e-5, -6.11e-5, -2.75e-5),
+    trunk_box=(0.267, 0.194, 0.114),
+    legs=("FR", "FL", "RR", "RL"),
+    mounts=((0.183, -0.047, 0), (0.183, 0.047, 0), (-0.183, -0.047, 0), (-0.183, 0.047, 0)),
+    links=(
+        Link("hip", 0.696, (-0.003311, -0.000635, 3.1e-5),
+             (0.000469246, 0.00080749, 0.000552929, 9.4e-6, -3.4e-7, 4.7e-7),
+             offset=(0, 0, 0), axis=(1, 0, 0), axis_left=(1, 0, 0), limits=(-0.802851, 0.802851), effort=33.5,
+             capsule=None, rear_mirrors_x=True),
+        Link("thigh", 1.013, (-0.003237, 0.022327, -0.027326),
+             (0.00552906, 0.00513934, 0.00136779, -4.8e-6, 3.44e-4, -2.24e-5),
+             offset=(0, _A1_THIGH_Y, 0), axis=(0, 1, 0), axis_left=(0, 1, 0), limits=(-1.0472, 4.18879), effort=33.5,
+             capsule=(0.015, (0, 0, -0.01), (0, 0, -0.185))),
+        Link("calf", 0.226, (0.00472659, 0, -0.131975),
+             (0.00338556, 0.00340344, 4.385e-5, 0, -1.67e-4, 0),
+             offset=(0, 0, -0.2), axis=(0, 1, 0), axis_left=(0, 1, 0), limits=(-2.69653, -0.916298), effort=33.5,
+             capsule=(0.01, (0, 0, 0), (0, 0, -0.18))),
+    ),
+    foot_position=(0, 0, -0.2),
+    foot_radius=0.02,
+    default_pose=((-0.1, 0.8, -1.5), (0.1, 0.8, -1.5), (-0.1, 1.0, -1.5), (0.1, 1.0, -1.5)),
+    start_height=0.42,
+    stiffness=20.0,
+    damping=0.5,
+    action_scale=0.25,
+    armature=0.01,
+    friction_loss=0.2,
+)  # fmt: skip
+
+ROBOTS = {"a1": A1}
+
+
+if __name__ == "__main__":
+    for robot in ROBOTS.values():
+        model = build_model(robot)
+        print(f"{robot.name}: {model.body_mass.sum():.3f} kg, {len(robot.legs)} legs of {len(robot.links)} joints")
+        print(f"  legs {', '.join(robot.legs)}; kp {robot.stiffness} N m/rad, kd {robot.damping} N m s/rad")
+        for link in robot.links:
+            low, high = link.limits
+            print(f"  {link.name:6s} {link.mass:.3f} kg, {low:+.2f} to {high:+.2f} rad, {link.effort} N m")

@@ -1,0 +1,186 @@
+"""ROLT, the robust locomotion transformer: the paper's section III in one file.
+
+Where each equation is:
+    eq. 1  e^l = MLP(s^l)             `leg_embedding`, one network for all legs
+    eq. 2  e^a = W a_{t-1} + b        `action_embedding`, the only thing that tells the legs apart
+    eq. 3  e^prop = [e^l..., e^a]     `tokens`, followed by the 12 height patches e^h = linear(s^h) + p_e
+    III-B  two encoder layers, linear decoder on the leg tokens        `EncoderLayer`, `forward`
+    III-C  feature dropout and position embedding (PE) dropout         `sample_masks`, `drop`, `tokens`
+
+Why no position embedding on the legs: with one, each leg learns a controller of its own, and what the front right leg
+has learned about limping stays there. Without one the legs share everything; where a leg is on the robot it must find
+out by comparing its own previous action with the action token.
+
+Why the masks are data: PPO compares the policy that acted with the policy that is updated. Drawn anew in the update,
+dropout would make them differ before a single weight has moved. So the rollout's masks are stored with the
+transition and passed to `forward` again (ppo.py); None, at test, means no dropout.
+
+Legend: B samples, L legs, J joints a leg, H steps of history, P = 12 patches, T = L + 1 + P tokens, D = 160 width.
+"""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+from env import HISTORY, SCAN_SHAPE, Observation
+from robots import Robot
+
+SIGMA_BOUNDS = (math.log(0.05), math.log(2.0))  # ours
+
+Masks = dict[str, Tensor]  # name -> (B, ...) bool, True = keep; empty for a policy without dropout
+
+
+@dataclass(frozen=True)
+class ROLTConfig:
+    """The model's hyper-parameters; the last three lines are the paper's ablations."""
+
+    width: int = 160  # D, paper
+    layers: int = 2  # paper
+    heads: int = 4  # ours: the paper names no number; 4 heads of 40
+    feedforward: int = 320  # ours: twice the width keeps it light
+    patch: int = 4  # points a side; 16 x 12 points make the paper's 12 patches
+    initial_sigma: float = 0.7  # ours: at legged_gym's 1.0 the robot falls before it learns anything for longer
+    feature_dropout: float = 0.1  # paper; 0 = the ablation No Feature Drop
+    pe_dropout: float = 0.75  # paper; 0 = the ablation No PE Drop
+    leg_pe: bool = False  # True = the ablation Module PE: a learned vector a leg instead of the action token
+
+
+def drop(x: Tensor, keep: Tensor | None, p: float) -> Tensor:
+    """Consistent dropout: a stored mask `keep` of x's shape, kept values scaled by 1 / (1 - p); None = identity."""
+    return x if keep is None else x * keep.to(x.dtype).mul_(1 / (1 - p))
+
+
+class EncoderLayer(nn.Module):
+    """Pre-norm transformer layer (ViT's; the paper names none) with dropout after attention and after the MLP."""
+
+    def __init__(self, config: ROLTConfig):
+        super().__init__()
+        D = config.width
+        assert D % config.heads == 0, "the width must be a multiple of the number of heads"
+        self.heads, self.p = config.heads, config.feature_dropout
+        self.norm_attention, self.norm_feedforward = nn.LayerNorm(D), nn.LayerNorm(D)
+        self.query, self.key_value, self.merge = nn.Linear(D, D), nn.Linear(D, 2 * D), nn.Linear(D, D)
+        self.feedforward = nn.Sequential(nn.Linear(D, config.feedforward), nn.GELU(), nn.Linear(config.feedforward, D))
+
+    def forward(self, x: Tensor, queries: int, keep_attention: Tensor | None, keep_feedforward: Tensor | None):
+        """Updates the first `queries` tokens only, from all of them.
+
+        What a token becomes depends on the other tokens' keys and values, never on their queries: leaving out those
+        that nobody reads afterwards changes nothing in the rest.
+
+        Args: x (B, T, D); masks (B, queries, D) or None.
+        Returns: tokens (B, queries, D), attention weights (B, heads, queries, T).
+        """
+        B, T, D = x.shape
+        heads, d = self.heads, D // self.heads
+        normed = self.norm_attention(x)
+        q = self.query(normed[:, :queries]).view(B, queries, heads, d).transpose(1, 2)  # (B, heads, queries, d)
+        k, v = self.key_value(normed).view(B, T, 2, heads, d).permute(2, 0, 3, 1, 4)  # (B, heads, T, d) each
+        weights = torch.softmax(q @ k.transpose(-2, -1) * d**-0.5, dim=-1)  # (B, heads, queries, T)
+        mixed = (weights @ v).transpose(1, 2).reshape(B, queries, D)
+        x = x[:, :queries] + drop(self.merge(mixed), keep_attention, self.p)
+        return x + drop(self.feedforward(self.norm_feedforward(x)), keep_feedforward, self.p), weights
+
+
+class ROLT(nn.Module):
+    """Gaussian policy: the mean of every joint's action from the transformer, and a learned sigma a kind of joint."""
+
+    def __init__(self, num_legs: int, num_joints: int, config: ROLTConfig = ROLTConfig()):
+        super().__init__()
+        self.config, self.num_legs, self.num_joints = config, num_legs, num_joints
+        D, rows, columns = config.width, SCAN_SHAPE[0] // config.patch, SCAN_SHAPE[1] // config.patch
+        self.num_patches = rows * columns
+        frame = 3 * num_joints + 12  # numbers that one leg sees in one step
+        self.leg_embedding = nn.Sequential(nn.Linear(HISTORY * frame, D), nn.GELU(), nn.Linear(D, D))
+        if config.leg_pe:
+            self.leg_position = nn.Parameter(0.02 * torch.randn(num_legs, D))  # 0.02: ViT's scale
+        else:
+            self.action_embedding = nn.Linear(num_legs * num_joints, D)
+        self.patch_embedding = nn.Linear(config.patch**2, D)
+        self.patch_position = nn.Parameter(0.02 * torch.randn(self.num_patches, D))  # p_e
+        self.dropped_position = nn.Parameter(0.02 * torch.randn(D))  # stands in for every dropped p_e
+        self.encoder = nn.ModuleList(EncoderLayer(config) for _ in range(config.layers))
+        self.norm = nn.LayerNorm(D)
+        self.decoder = nn.Linear(D, num_joints)
+        nn.init.normal_(self.decoder.weight, std=0.01)  # start from the default pose
+        # shared by the legs, as the weights are; independent of the state, as in legged_gym
+        self.log_sigma = nn.Parameter(torch.full((num_joints,), config.initial_sigma).log())
+
+    @property
+    def num_proprioceptive(self) -> int:
+        """Tokens before the patches: the legs, and the action token unless `leg_pe`."""
+        return self.num_legs + (not self.config.leg_pe)
+
+    def sigma(self) -> Tensor:
+        """(L*J,) standard deviation of every action, within bounds that no healthy run meets."""
+        return self.log_sigma.clamp(*SIGMA_BOUNDS).exp().repeat(self.num_legs)
+
+    def sample_masks(self, n: int, generator: torch.Generator) -> Masks:
+        """Dropout masks for n samples: (n, P) patches that keep their p_e, (n, tokens, D) features that are kept."""
+
+        def keep(p: float, *shape: int) -> Tensor:
+            return torch.rand(n, *shape, generator=generator, device=generator.device) >= p
+
+        masks = {}
+        if self.config.pe_dropout > 0:
+            masks["patch_position"] = keep(self.config.pe_dropout, self.num_patches)
+        if self.config.feature_dropout > 0:
+            for i in range(len(self.encoder)):
+                shape = (self._queries(i), self.config.width)
+                masks[f"attention_{i}"] = keep(self.config.feature_dropout, *shape)
+                masks[f"feedforward_{i}"] = keep(self.config.feature_dropout, *shape)
+        return masks
+
+    def forward(self, observation: Observation, masks: Masks | None = None) -> Tensor:
+        """(B, L*J) mean action: J joint targets from each leg's token. masks: of `sample_masks`, None = test."""
+        return self._encode(observation, masks)[0]
+
+    def attention(self, observation: Observation) -> Tensor:
+        """(B, layers, heads, L, T) weights that the leg tokens give to [legs, action, patches], without dropout."""
+        return torch.stack([weights[:, :, : self.num_legs] for weights in self._encode(observation, None)[1]], dim=1)
+
+    def tokens(self, observation: Observation, masks: Masks | None) -> Tensor:
+        """E_0 = [e^prop, e^h], (B, T, D)."""
+        masks = masks or {}
+        legs = self.leg_embedding(observation.legs.flatten(2))  # (B, L, H*frame) -> (B, L, D), eq. 1
+        if self.config.leg_pe:
+            proprioception = legs + self.leg_position
+        else:
+            action = self.action_embedding(observation.action)  # (B, D), eq. 2
+            proprioception = torch.cat([legs, action[:, None]], dim=1)  # (B, L+1, D), eq. 3
+
+        B, (rows, columns), s = len(legs), SCAN_SHAPE, self.config.patch
+        patches = observation.heights.view(B, rows // s, s, columns // s, s).transpose(2, 3)  # (B, 4, 3, s, s)
+        patches = self.patch_embedding(patches.reshape(B, self.num_patches, s * s))  # (B, P, D)
+        position = self.patch_position
+        if "patch_position" in masks:
+            position = torch.where(masks["patch_position"][:, :, None], position, self.dropped_position)  # (B, P, D)
+        return torch.cat([proprioception, patches + position], dim=1)
+
+    def _queries(self, layer: int) -> int:
+        """How many tokens a layer updates: all that the next one reads; after the last only the legs are read."""
+        last = layer == self.config.layers - 1
+        return self.num_legs if last else self.num_proprioceptive + self.num_patches
+
+    def _encode(self, observation: Observation, masks: Masks | None) -> tuple[Tensor, list[Tensor]]:
+        x, masks, attention = self.tokens(observation, masks), masks or {}, []
+        for i, layer in enumerate(self.encoder):
+            x, weights = layer(x, self._queries(i), masks.get(f"attention_{i}"), masks.get(f"feedforward_{i}"))
+            attention.append(weights)
+        return self.decoder(self.norm(x)).flatten(1), attention  # (B, L, J) -> (B, L*J)
+
+
+# The policies of `train.py --policy`: ROLT and the paper's ablations of it.
+POLICIES = {
+    "rolt": ROLTConfig(),
+    "module-pe": ROLTConfig(leg_pe=True),
+    "no-pe-drop": ROLTConfig(pe_dropout=0.0),
+    "no-feature-drop": ROLTConfig(feature_dropout=0.0),
+}
+
+
+def make_policy(name: str, robot: Robot) -> nn.Module:
+    """A policy for the robot, with fresh weights from torch's global generator."""
+    return ROLT(len(robot.legs), len(robot.links), POLICIES[name])

@@ -1,0 +1,269 @@
+"""Trains a policy: PPO on every core, or on a GPU.
+
+    python train.py --robot a1                            # ROLT on the stiffness task, about an hour on two cores
+    python train.py --robot a1 --steps 20000              # does it run? half a minute
+    python train.py --robot a1 --resume                   # goes on where it was stopped (Ctrl-C is safe)
+    python train.py --robot a1 --paper --device cuda      # the paper's size: 4096 robots, 400 million steps
+
+Everything goes to runs/ROBOT-TASK-POLICY-seedN (or --out): policy.pt (for evaluate.py), checkpoint.pt (for --resume),
+progress.csv (a row an iteration) and progress.png.
+
+On a CPU every core gets a process of its own with its share of the robots; the processes sum their gradients
+(torch.distributed). Two processes of one thread run nearly twice as fast as one process of two threads.
+"""
+
+import csv
+import math
+import os
+import signal
+import sys
+import tempfile
+import time
+from collections import deque
+from pathlib import Path
+
+import torch
+import torch.distributed as dist
+import torch.multiprocessing as mp
+
+import checkpoint
+from cli import Parser, count, fail, num_cores, positive, seed, writable_folder
+from env import CONTROL_DT, LocomotionEnv
+from faults import TASKS
+from plots import learning_curve
+from ppo import Critic, Learner, PPOConfig, RolloutBuffer, all_reduce, collect, to_tensors
+from rewards import REWARDS
+from robots import ROBOTS
+from rolt import POLICIES, make_policy
+
+# What a run may not change when it is resumed.
+IDENTITY = ("robot", "task", "policy", "envs", "epochs", "minibatches", "seed", "processes")
+
+
+def parse_arguments(argv: list[str] | None = None):
+    parser = Parser(__doc__)
+    parser.add_argument("--robot", choices=ROBOTS, default="a1")
+    parser.add_argument("--task", choices=TASKS, default="stiffness", help="which faults are trained (faults.py)")
+    parser.add_argument("--policy", choices=POLICIES, default="rolt")
+    parser.add_argument("--envs", type=count, default=256, help="robots simulated at once")
+    parser.add_argument("--steps", type=count, default=6_000_000, help="env steps in total, over all robots")
+    parser.add_argument("--epochs", type=count, default=PPOConfig.epochs, help="of PPO, over each rollout")
+    parser.add_argument("--minibatches", type=count, default=PPOConfig.minibatches, help="an epoch")
+    parser.add_argument("--paper", action="store_true", help="4096 robots, 400M steps, 5 epochs of 4 minibatches")
+    parser.add_argument("--seed", type=seed, default=0)
+    parser.add_argument("--device", choices=("auto", "cpu", "cuda"), default="auto", help="auto: cuda if there is one")
+    parser.add_argument("--threads", type=count, default=num_cores(), help="cores to use (default: all)")
+    parser.add_argument("--out", type=Path, help="folder of the run (default: runs/ROBOT-TASK-POLICY-seedN)")
+    parser.add_argument("--resume", action="store_true", help="go on from the checkpoint in that folder")
+    parser.add_argument("--save-minutes", type=positive, default=3.0, help="time between two checkpoints")
+    args = parser.parse_args(argv)
+
+    if args.paper:
+        args.envs, args.steps, args.epochs, args.minibatches = 4096, 400_000_000, 5, 4
+    if args.robot not in TASKS[args.task].robots:
+        fail(f"the task {args.task} is for {', '.join(TASKS[args.task].robots)}, not for {args.robot}")
+    if args.device == "cuda" and not torch.cuda.is_available():
+        fail("torch finds no CUDA device; leave --device away to train on the CPU")
+    if args.device == "auto":
+        args.device = "cuda" if torch.cuda.is_available() else "cpu"
+    args.processes = int(os.environ.get("WORLD_SIZE", 1 if args.device == "cuda" else args.threads))
+    if args.envs % args.processes:
+        fail(f"{args.envs} robots do not divide among {args.processes} processes; change --envs or --threads")
+    if args.envs // args.processes * PPOConfig.steps < args.minibatches:
+        fail(f"{args.envs} robots are too few for {args.minibatches} minibatches on {args.processes} processes")
+    args.out = args.out or Path("runs") / f"{args.robot}-{args.task}-{args.policy}-seed{args.seed}"
+    saved = args.out / "checkpoint.pt"
+    if args.resume and not saved.exists():
+        fail(f"there is nothing to resume in {args.out}; leave --resume away to start there")
+    if saved.exists() and not args.resume:
+        fail(f"{args.out} holds a run already; go on with --resume, or choose another --out or --seed")
+    writable_folder(args.out)
+    return args
+
+
+class Progress:
+    """One CSV row an iteration, the picture of it, and the live line."""
+
+    def __init__(self, args, iteration: int, steps: int):
+        self.args, self.path, self.start, self.first = args, args.out / "progress.csv", time.time(), steps
+        self.episodes = deque(maxlen=20)  # of the last iterations: (number, sum of returns, of lengths, falls)
+        rows = []
+        if iteration and self.path.exists():  # drop what was logged after the checkpoint that we go on from
+            with open(self.path, newline="") as file:
+                rows = list(csv.reader(file))[: iteration + 1]
+        with open(self.path, "w", newline="") as file:
+            csv.writer(file).writerows(rows)
+
+    def log(self, row: dict, episodes: tuple[float, ...]) -> None:
+        """Writes the row and prints the line (every tenth one if the output is not a terminal)."""
+        self.episodes.append(episodes)
+        number, returns, lengths, falls = (sum(column) for column in zip(*self.episodes))
+        recent = [x / number if number else math.nan for x in (returns, lengths * CONTROL_DT, falls)]
+        row |= dict(zip(("episode_return", "episode_seconds", "falls"), recent))
+        with open(self.path, "a", newline="") as file:
+            writer = csv.DictWriter(file, list(row))
+            if file.tell() == 0:
+                writer.writeheader()
+            writer.writerow({name: f"{value:.6g}" if isinstance(value, float) else value for name, value in row.items()})
+
+        steps, total = row["steps"], self.args.steps
+        rate = (steps - self.first) / (time.time() - self.start)
+        bar = "#" * int(20 * min(1, steps / total))
+        line = (
+            f"[{bar:.<20}] {steps / 1e6:.2f}/{total / 1e6:.2f}M {rate:,.0f}/s {max(0, total - steps) / rate / 60:.0f} min left"
+            f" | return {recent[0]:.1f} speed {row['speed']:.2f} of {row['commanded_speed']:.2f} m/s"
+            f" episode {recent[1]:.1f} s falls {recent[2]:.0%} sigma {row['sigma']:.2f} KL {row['kl']:.3f}"
+        )
+        if sys.stdout.isatty():
+            print(f"\r{line}\033[K", end="", flush=True)
+        elif row["iteration"] % 10 == 1:
+            print(line, flush=True)
+
+
+def train(rank: int, args, sync: str | None) -> None:
+    """The training loop of one process."""
+    if args.processes > 1:
+        backend = "nccl" if args.device == "cuda" else "gloo"
+        dist.init_process_group(backend, init_method=sync, rank=rank, world_size=args.processes)
+    torch.set_num_threads(1)
+    device = torch.device(args.device, int(os.environ.get("LOCAL_RANK", 0))) if args.device == "cuda" else torch.device("cpu")
+    config = PPOConfig(epochs=args.epochs, minibatches=args.minibatches)
+    threads = args.threads if args.device == "cuda" else 1
+    faults = TASKS[args.task].training
+    env = LocomotionEnv(args.robot, args.envs // args.processes, (args.seed, rank), threads, faults)
+    observation = env.reset(random_ages=True)
+
+    torch.manual_seed(args.seed)  # the same weights in every process
+    policy = make_policy(args.policy, env.robot).to(device)
+    critic = Critic(observation).to(device)
+    generator = torch.Generator(device).manual_seed(args.seed * 1_000_003 + rank)  # actions, masks, minibatches
+    buffer = RolloutBuffer(config.steps, observation, env.num_actions, policy.sample_masks(env.num_envs, generator), device)
+    learner = Learner(policy, critic, config)
+    iteration, steps = 0, 0
+
+    if args.resume:
+        saved = checkpoint.load(args.out / "checkpoint.pt")
+        iteration, steps = saved["iteration"], saved["steps"]
+        policy.load_state_dict(saved["weights"])
+        critic.load_state_dict(saved["critic"])
+        learner.load_state_dict(saved["learner"])
+        env.load_state_dict(from_tensors(saved["processes"][rank]["env"]))
+        generator.set_state(saved["processes"][rank]["generator"])
+        observation = env.observe()
+
+    def save() -> None:
+        """Rank 0 writes what it is told by all."""
+        mine = {"env": to_plain(env.state_dict()), "generator": generator.get_state()}
+        everyone = [None] * args.processes if rank == 0 else None
+        if args.processes > 1:
+            dist.gather_object(mine, everyone)
+        else:
+            everyone = [mine]
+        if rank == 0:
+            card = {key: getattr(args, key) for key in ("robot", "task", "policy", "seed")} | {"steps": steps}
+            weights = {name: tensor.cpu() for name, tensor in policy.state_dict().items()}
+            checkpoint.save(card | {"weights": weights}, args.out / "policy.pt")
+            more = {"critic": critic.state_dict(), "learner": learner.state_dict(), "processes": everyone}
+            identity = {key: getattr(args, key) for key in IDENTITY}
+            content = card | {"weights": weights, "iteration": iteration, "identity": identity}
+            checkpoint.save(content | more, args.out / "checkpoint.pt")
+            learning_curve(args.out / "progress.csv", args.out / "progress.png")
+
+    stop = []  # Ctrl-C and SIGTERM end the run after the iteration that they interrupt
+    for signum in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(signum, lambda *_: stop.append(True))
+    progress = Progress(args, iteration, steps) if rank == 0 else None
+    saved_at = time.time()
+    while steps < args.steps:
+        started = time.perf_counter()
+        observation, infos = collect(env, policy, critic, buffer, observation, generator)
+        collected = time.perf_counter()
+        losses = learner.update(buffer, generator)
+        updated = time.perf_counter()
+        iteration, steps = iteration + 1, steps + len(buffer) * args.processes
+
+        # sums over this process's robots and steps, then over all processes
+        terms = [torch.stack([torch.tensor(i["rewards"][term.__name__].mean()) for i in infos]).mean() for term in REWARDS]
+        returns = torch.tensor([x for i in infos for x in i["episode_returns"]], dtype=torch.float64)
+        lengths = torch.tensor([float(x) for i in infos for x in i["episode_lengths"]], dtype=torch.float64)
+        means = [sum(i[key].mean() for i in infos) / len(infos) for key in ("speed", "commanded_speed")] + terms
+        sums = [len(returns), returns.sum(), lengths.sum(), buffer.terminated.sum(), env.divergences]
+        overdue = time.time() - saved_at > 60 * args.save_minutes
+        flags = [float(bool(stop)), float(rank == 0 and overdue)]  # all processes must agree on these
+        shared = all_reduce(torch.tensor([float(x) for x in (*means, *sums, *flags)], dtype=torch.float64)).tolist()
+        speed, commanded, *terms = (x / args.processes for x in shared[: len(means)])
+        *episodes, divergences = shared[len(means) : -2]
+        must_stop, must_save = shared[-2] > 0, shared[-1] > 0
+
+        if rank == 0:
+            row = {"iteration": iteration, "steps": steps, "speed": speed, "commanded_speed": commanded}
+            row |= {"sigma": policy.sigma().mean().item(), "learning_rate": learner.learning_rate} | losses
+            row |= {f"reward_{term.__name__}": value for term, value in zip(REWARDS, terms)}
+            row |= {"divergences": int(divergences), "collect_seconds": collected - started}
+            progress.log(row | {"update_seconds": updated - collected}, tuple(episodes))
+        if must_save or must_stop or steps >= args.steps:
+            save()
+            saved_at = time.time()
+        if must_stop:
+            break
+
+    if rank == 0:
+        policy_file = args.out / "policy.pt"
+        if steps < args.steps:
+            print(f"\nstopped at {steps:,} steps and saved; the same command with --resume goes on")
+        print(f"\ntrained: {policy_file}\ntest it: python evaluate.py {args.task} --checkpoints {policy_file}")
+    if args.processes > 1:
+        dist.destroy_process_group()
+
+
+def to_plain(value):
+    """Numpy arrays as tensors, all the way down: what a checkpoint may hold."""
+    if isinstance(value, dict):
+        return {key: to_plain(item) for key, item in value.items()}
+    return torch.from_numpy(value) if hasattr(value, "__array__") else value
+
+
+def from_tensors(value):
+    """The inverse of `to_plain`."""
+    if isinstance(value, dict):
+        return {key: from_tensors(item) for key, item in value.items()}
+    return value.numpy() if isinstance(value, torch.Tensor) else value
+
+
+def guarded(rank: int, args, sync: str | None) -> None:
+    """`train`, with what a user can mend said in one line."""
+    try:
+        train(rank, args, sync)
+    except (OSError, FloatingPointError, checkpoint.CheckpointError) as error:
+        print(f"\nerror: {error}", file=sys.stderr)
+        os._exit(1)  # at once: the other processes wait for this one and are ended by the parent
+
+
+def main(argv: list[str] | None = None) -> None:
+    args = parse_arguments(argv)
+    if args.resume:
+        try:
+            identity = checkpoint.load(args.out / "checkpoint.pt").get("identity", {})
+        except checkpoint.CheckpointError as error:
+            fail(error)
+        differing = [f"{key} was {identity.get(key)}, is {getattr(args, key)}" for key in IDENTITY if identity.get(key) != getattr(args, key)]
+        if differing:
+            fail(f"the run in {args.out} was another one: {'; '.join(differing)}")
+    if "RANK" in os.environ:  # started by torchrun, which has made the processes
+        guarded(int(os.environ["RANK"]), args, "env://")
+    elif args.processes == 1:
+        guarded(0, args, None)
+    else:
+        with tempfile.TemporaryDirectory() as folder:
+            children = mp.spawn(guarded, (args, f"file://{folder}/sync"), nprocs=args.processes, join=False)
+            for signum in (signal.SIGINT, signal.SIGTERM):  # the children save and end; this process waits for them
+                signal.signal(signum, lambda number, _: [os.kill(p.pid, number) for p in children.processes if p.is_alive()])
+            try:
+                while not children.join():
+                    pass
+            except mp.ProcessExitedException as error:
+                sys.exit(f"process {error.error_index} ended early; {args.out} holds the last checkpoint: add --resume")
+
+
+if __name__ == "__main__":
+    main()
