@@ -61,7 +61,7 @@ class EncoderLayer(nn.Module):
         assert D % config.heads == 0, "the width must be a multiple of the number of heads"
         self.heads, self.p = config.heads, config.feature_dropout
         self.norm_attention, self.norm_feedforward = nn.LayerNorm(D), nn.LayerNorm(D)
-        self.query, self.key_value, self.merge = nn.Linear(D, D), nn.Linear(D, 2 * D), nn.Linear(D, D)
+        self.query, self.key, self.value, self.merge = (nn.Linear(D, D) for _ in range(4))
         self.feedforward = nn.Sequential(nn.Linear(D, config.feedforward), nn.GELU(), nn.Linear(config.feedforward, D))
 
     def forward(self, x: Tensor, queries: int, keep_attention: Tensor | None, keep_feedforward: Tensor | None):
@@ -74,14 +74,17 @@ class EncoderLayer(nn.Module):
         Returns: tokens (B, queries, D), attention weights (B, heads, queries, T).
         """
         B, T, D = x.shape
-        heads, d = self.heads, D // self.heads
         normed = self.norm_attention(x)
-        q = self.query(normed[:, :queries]).view(B, queries, heads, d).transpose(1, 2)  # (B, heads, queries, d)
-        k, v = self.key_value(normed).view(B, T, 2, heads, d).permute(2, 0, 3, 1, 4)  # (B, heads, T, d) each
-        weights = torch.softmax(q @ k.transpose(-2, -1) * d**-0.5, dim=-1)  # (B, heads, queries, T)
-        mixed = (weights @ v).transpose(1, 2).reshape(B, queries, D)
-        x = x[:, :queries] + drop(self.merge(mixed), keep_attention, self.p)
+        active, x = (normed, x) if queries == T else (normed[:, :queries], x[:, :queries])
+        q, k, v = self._split(self.query(active)), self._split(self.key(normed)), self._split(self.value(normed))
+        weights = torch.softmax(q @ k.transpose(-2, -1) * q.shape[-1] ** -0.5, dim=-1)  # (B, heads, queries, T)
+        mixed = (weights @ v).transpose(1, 2).reshape(B, queries, D)  # (B, heads, queries, d) -> (B, queries, D)
+        x = x + drop(self.merge(mixed), keep_attention, self.p)
         return x + drop(self.feedforward(self.norm_feedforward(x)), keep_feedforward, self.p), weights
+
+    def _split(self, x: Tensor) -> Tensor:
+        """(B, T, D) -> (B, heads, T, d)"""
+        return x.unflatten(-1, (self.heads, -1)).transpose(1, 2)
 
 
 class ROLT(nn.Module):
