@@ -106,6 +106,11 @@ class RolloutBuffer:
         return batch
 
 
+def gaussian(mean: Tensor, sigma: Tensor) -> Normal:
+    """Unchecked: a NaN is caught where its name is known, in `Learner._step`."""
+    return Normal(mean, sigma, validate_args=False)
+
+
 def to_tensors(observation: Observation, device) -> Observation:
     return Observation(*(torch.from_numpy(field).to(device) for field in observation))
 
@@ -129,7 +134,7 @@ def collect(
         for name, mask in masks.items():
             buffer.masks[name][t] = pack_bits(mask)
         buffer.action[t], buffer.mean[t], buffer.value[t] = action, mean, critic(observation)
-        buffer.log_prob[t] = Normal(mean, buffer.sigma).log_prob(action).sum(-1)
+        buffer.log_prob[t] = gaussian(mean, buffer.sigma).log_prob(action).sum(-1)
 
         observation, reward, terminated, truncated, info = env.step(action.cpu().numpy())
         buffer.reward[t] = torch.from_numpy(reward)
@@ -254,7 +259,7 @@ class Learner:
     def _accumulate(self, batch: dict, old_sigma: Tensor, share: float) -> None:
         """Adds a micro-batch's gradient; `share` is its part of the minibatch over all processes."""
         mean = self.policy(batch["observation"], batch["masks"])
-        old, new = Normal(batch["mean"], old_sigma), Normal(mean, self.policy.sigma())
+        old, new = gaussian(batch["mean"], old_sigma), gaussian(mean, self.policy.sigma())
         loss, stats = ppo_loss(
             new.log_prob(batch["action"]).sum(-1), batch["log_prob"], batch["advantage"],
             self.critic(batch["observation"]), batch["value"], batch["value_target"], new.entropy().sum(-1), self.config,

@@ -234,7 +234,7 @@ def guarded(rank: int, args, sync: str | None) -> None:
     """`train`, with what a user can mend said in one line."""
     try:
         train(rank, args, sync)
-    except (OSError, FloatingPointError, checkpoint.CheckpointError) as error:
+    except (OSError, FloatingPointError, ValueError) as error:
         print(f"\nerror: {error}", file=sys.stderr)
         os._exit(1)  # at once: the other processes wait for this one and are ended by the parent
 

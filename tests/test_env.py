@@ -1,0 +1,199 @@
+"""The env: what it observes, rewards, ends and repeats."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+import rewards
+from env import CONTROL_DT, EnvConfig, LocomotionEnv
+from faults import TASKS
+
+
+def rollout(threads=1, seed=0, steps=60):
+    env = LocomotionEnv("a1", 8, seed, threads, TASKS["stiffness"].training)
+    env.reset(random_ages=True)
+    rng, trace = np.random.default_rng(1), []
+    for _ in range(steps):
+        observation, reward, terminated, truncated, info = env.step(rng.normal(size=(8, 12)))
+        trace += [*observation, reward, terminated, truncated, info["position"]]
+    return trace
+
+
+def test_bit_identical_for_a_seed_at_any_number_of_threads():
+    one, two, other = rollout(threads=1), rollout(threads=2), rollout(seed=5)
+    assert all(np.array_equal(a, b) for a, b in zip(one, two))
+    assert not all(np.array_equal(a, b) for a, b in zip(one, other))
+
+
+def test_goes_on_to_the_bit_after_a_break():
+    def make():
+        return LocomotionEnv("a1", 6, 2, 1, TASKS["stiffness"].training, EnvConfig(episode_seconds=0.5))
+
+    env, rng = make(), np.random.default_rng(0)
+    env.reset(random_ages=True)
+    actions = rng.normal(size=(40, 6, 12))
+    for action in actions[:20]:
+        env.step(action)
+    twin = make()
+    twin.load_state_dict(env.state_dict())
+    for field, other in zip(env.observe(), twin.observe()):
+        assert np.array_equal(field, other)
+    for action in actions[20:]:  # resets included: an episode has 25 steps
+        a, b = env.step(action), twin.step(action)
+        assert all(np.array_equal(x, y) for x, y in zip((*a[0], *a[1:4]), (*b[0], *b[1:4])))
+
+
+def test_history_rolls_oldest_first_and_starts_filled():
+    env = LocomotionEnv("a1", 3, num_threads=1)
+    first = env.reset().legs
+    assert first.shape == (3, 4, 10, 21)
+    assert np.array_equal(first, np.repeat(first[:, :, :1], 10, axis=2))
+    rng, before = np.random.default_rng(0), first
+    for _ in range(12):
+        action = rng.normal(size=(3, 12))
+        after, *_ = env.step(action)
+        assert np.array_equal(after.legs[:, :, :-1], before[:, :, 1:])
+        assert np.allclose(after.legs[:, :, -1, 6:9], action.reshape(3, 4, 3))  # the leg's own previous action
+        assert np.allclose(after.action, action)
+        assert np.allclose(after.legs[:, :, -1, 0:3], env.joint_error)
+        assert np.allclose(after.legs[:, :, -1, 3:6], 0.05 * env.joint_velocity)
+        before = after.legs
+
+
+def test_body_velocities_and_gravity_are_in_the_trunks_frame():
+    """Yawed 90 degrees left and driven along world x, the robot moves to its right. Pitched nose down by 0.3 rad,
+    gravity points forward."""
+    env = LocomotionEnv("a1", 1, num_threads=1)
+    env.reset()
+    env._qpos[0, 3:7] = [np.sqrt(0.5), 0, 0, np.sqrt(0.5)]
+    env._qvel[0, :6] = [1, 0, 0, 0, 0, 0.7]
+    env._read_state()
+    assert env.yaw[0] == pytest.approx(np.pi / 2)
+    assert env.linear_velocity[0] == pytest.approx([0, -1, 0])
+    assert env.angular_velocity[0] == pytest.approx([0, 0, 0.7])
+    assert env.gravity[0] == pytest.approx([0, 0, -1])
+    env._qpos[0, 3:7] = [np.cos(0.15), 0, np.sin(0.15), 0]
+    env._read_state()
+    assert env.gravity[0] == pytest.approx([np.sin(0.3), 0, -np.cos(0.3)])
+
+
+def test_scan_of_flat_ground_is_the_trunks_height():
+    env = LocomotionEnv("a1", 2, num_threads=1)
+    heights = env.reset().heights
+    assert heights.shape == (2, 16, 12)
+    assert np.allclose(heights, 5 * (0.42 - 0.5))  # every reset starts at 0.42 m
+
+
+def test_steering_follows_the_heading():
+    env = LocomotionEnv("a1", 4, num_threads=1)
+    env.reset()
+    env.yaw, env.heading = np.array([0.0, 0.0, 3.0, 0.0]), np.array([0.5, -3.0, -3.0, np.pi])
+    env._steer()
+    # half the error; at most 1 rad/s; the short way round: from 3.0 on to 2 pi - 3.0
+    assert env.command[:3, 2] == pytest.approx([0.25, -1.0, 0.5 * (2 * np.pi - 6.0)])
+    assert abs(env.command[3, 2]) == 1.0
+
+
+def test_timeout_gives_the_true_last_observation_and_restarts():
+    env = LocomotionEnv("a1", 2, num_threads=1, config=EnvConfig(episode_seconds=5 * CONTROL_DT, start_speed=0.0))
+    env.reset()
+    for step in range(5):
+        before = env.observe().legs
+        observation, _, terminated, truncated, info = env.step(np.zeros((2, 12)))
+        assert truncated.all() == (step == 4) and not terminated.any()
+    assert info["truncated_ids"].tolist() == [0, 1]
+    assert np.array_equal(info["final_observation"].legs[:, :, :-1], before[:, :, 1:])  # of the old episode
+    assert np.array_equal(observation.legs, np.repeat(observation.legs[:, :, :1], 10, axis=2))  # of the new one
+    assert info["episode_lengths"].tolist() == [5, 5] and env.age.tolist() == [0, 0]
+
+
+def test_a_robot_on_its_back_has_fallen_and_the_others_go_on():
+    env = LocomotionEnv("a1", 3, num_threads=1)
+    env.reset()
+    env._qpos[1, 3:7] = [0, 1, 0, 0]
+    _, _, terminated, truncated, info = env.step(np.zeros((3, 12)))
+    assert terminated.tolist() == [False, True, False] and not truncated.any()
+    assert env.age.tolist() == [1, 0, 1] and len(info["episode_returns"]) == 1
+    assert env.gravity[1, 2] == pytest.approx(-1)  # upright again
+
+
+def test_trunk_on_the_ground_is_a_fall():
+    env = LocomotionEnv("a1", 1, num_threads=1, config=EnvConfig(start_speed=0.0))
+    env.reset()
+    env._qpos[0, 2], env._qpos[0, 7:] = 0.05, np.tile([0.0, 2.8, -2.6], 4)  # legs folded beside it
+    assert env.step(np.zeros((1, 12)))[2].all()
+
+
+def test_diverged_simulation_is_ended_counted_and_harms_nobody():
+    quiet = EnvConfig(start_speed=0.0, push_speed=0.0)
+    env, twin = (LocomotionEnv("a1", 3, num_threads=1, config=quiet) for _ in range(2))
+    env.reset(), twin.reset()
+    env._qvel[1, 7] = np.nan
+    observation, reward, terminated, _, info = env.step(np.zeros((3, 12)))
+    expected, *_ = twin.step(np.zeros((3, 12)))
+    assert info["diverged"].tolist() == [False, True, False] == terminated.tolist()
+    assert env.divergences == 1 and reward[1] == 0
+    assert all(np.isfinite(field).all() for field in observation) and np.isfinite(reward).all()
+    assert np.array_equal(observation.legs[[0, 2]], expected.legs[[0, 2]])
+    _, _, terminated, _, info = env.step(np.zeros((3, 12)))
+    assert not info["diverged"].any() and not terminated.any()
+
+
+def test_wrong_use_is_refused():
+    with pytest.raises(ValueError, match="unknown robot 'a2'; there is a1"):
+        LocomotionEnv("a2", 1)
+    with pytest.raises(ValueError, match="at least 1"):
+        LocomotionEnv("a1", 0)
+    env = LocomotionEnv("a1", 1, num_threads=1)
+    env.reset()
+    with pytest.raises(ValueError, match="not finite"):
+        env.step(np.full((1, 12), np.nan))
+
+
+# One robot, every number chosen so that each term can be worked out in the head.
+BY_HAND = SimpleNamespace(
+    command=np.array([[0.5, 0.0, 0.2]]),
+    linear_velocity=np.array([[0.2, 0.4, 0.3]]),  # error (-0.3, 0.4): squared norm 0.25
+    angular_velocity=np.array([[0.1, -0.2, 0.7]]),  # yaw error 0.5: squared 0.25
+    link_contact=np.array([[True, False, False, True, False, False, False, True]]),
+    torque=np.full((1, 4, 3), 2.0),  # 12 * 4 = 48
+    action=np.full((1, 4, 3), 0.5),
+    last_action=np.full((1, 4, 3), 0.4),  # 12 * 0.01 = 0.12
+    touchdown=np.array([[True, False, True, False]]),
+    air_time=np.array([[0.7, 0.9, 0.4, 0.0]]),  # (0.7 - 0.5) + (0.4 - 0.5) = 0.1
+    joint_error=np.full((1, 4, 3), -0.1),  # 12 * 0.01 = 0.12
+)
+
+
+@pytest.mark.parametrize(
+    "term, value, weight",
+    [
+        (rewards.xy_velocity_tracking, np.exp(-1), 1.5),
+        (rewards.yaw_velocity_tracking, np.exp(-1), 0.5),
+        (rewards.z_velocity, 0.09, -2.0),
+        (rewards.roll_pitch_velocity, 0.05, -0.05),
+        (rewards.collision, 3, -1.0),
+        (rewards.joint_torques, 48, -2e-4),
+        (rewards.action_rate, 0.12, -0.01),
+        (rewards.foot_air_time, 0.1, 1.0),
+        (rewards.joint_error, 0.12, -0.04),
+    ],
+)
+def test_reward_term_by_hand(term, value, weight):
+    assert term(BY_HAND)[0] == pytest.approx(value)
+    assert rewards.REWARDS[term] == weight
+
+
+def test_reward_is_scaled_by_time_and_floored_at_zero():
+    bad, terms = rewards.total_reward(BY_HAND, 0.02)
+    assert sum(t[0] for t in terms.values()) == pytest.approx(2 * np.exp(-1) - 0.18 - 0.0025 - 3 - 0.0096 - 0.0012 + 0.1 - 0.0048)
+    assert bad[0] == 0.0
+    good = SimpleNamespace(**(vars(BY_HAND) | {"link_contact": np.zeros((1, 8), bool)}))
+    reward, terms = rewards.total_reward(good, 0.02)
+    assert reward[0] == pytest.approx(0.02 * sum(t[0] for t in terms.values())) and reward[0] > 0
+
+
+def test_standing_still_earns_no_air_time():
+    still = SimpleNamespace(**(vars(BY_HAND) | {"command": np.array([[0.0, 0.05, 0.9]])}))
+    assert rewards.foot_air_time(still)[0] == 0.0

@@ -1,0 +1,140 @@
+"""The model against its data sheet, and faults on simulated robots."""
+
+import mujoco
+import numpy as np
+import pytest
+
+from env import EnvConfig, LocomotionEnv
+from faults import TASKS, Fault, disable, healthy, lock, motor_strength, parse, weaken
+from robots import A1, ROBOTS, build_model
+
+QUIET = EnvConfig(push_speed=0.0, start_speed=0.0, start_pose=(1.0, 1.0), friction=(1.0, 1.0))
+
+
+@pytest.mark.parametrize("robot", ROBOTS.values(), ids=ROBOTS)
+def test_model_agrees_with_the_data(robot):
+    model = build_model(robot)
+    joints = len(robot.legs) * len(robot.links)
+    assert (model.nu, model.neq, model.nv) == (joints, joints, joints + 6)
+    total = robot.trunk_mass + len(robot.legs) * sum(link.mass for link in robot.links)
+    assert model.body_mass.sum() == pytest.approx(total)
+    for i, name in enumerate(robot.joints):
+        link = robot.links[i % len(robot.links)]
+        assert model.actuator(i).name == model.equality(i).name == name
+        assert model.joint(name).range == pytest.approx(link.limits)
+        assert model.actuator(i).forcerange == pytest.approx([-link.effort, link.effort])
+
+
+def test_a1_weighs_what_unitree_says():
+    assert build_model(A1).body_mass.sum() == pytest.approx(12.453, abs=1e-6)
+
+
+@pytest.mark.parametrize("robot", ROBOTS.values(), ids=ROBOTS)
+def test_legs_are_mirror_images(robot):
+    """In the default pose every leg's foot and centres of mass have a twin on the other side."""
+    model = build_model(robot)
+    data = mujoco.MjData(model)
+    mujoco.mj_resetDataKeyframe(model, data, 0)
+    mujoco.mj_forward(model, data)
+    for right in (leg for leg in robot.legs if leg.endswith("R")):
+        left = right[:-1] + "L"
+        for link in robot.links:
+            twin = data.body(f"{left}_{link.name}").xipos * [1, -1, 1]
+            assert data.body(f"{right}_{link.name}").xipos == pytest.approx(twin, abs=1e-6)
+        assert data.geom(f"{right}_foot").xpos == pytest.approx(data.geom(f"{left}_foot").xpos * [1, -1, 1], abs=1e-6)
+
+
+@pytest.mark.parametrize("robot", ROBOTS)
+def test_stands_under_zero_action(robot):
+    env = LocomotionEnv(robot, 2, num_threads=1, config=QUIET)
+    env.reset()
+    for _ in range(150):
+        _, _, terminated, _, _ = env.step(np.zeros((2, env.num_actions)))
+        assert not terminated.any()
+    assert env.foot_contact.all() and not env.link_contact.any()
+    assert env.gravity[:, 2] == pytest.approx(-1, abs=0.01)
+
+
+def test_locked_joint_holds_under_load_and_is_free_after_reset():
+    """FR calf locked, 20 kg on its back and the policy flailing: it stays. Healthy again, it moves."""
+    env = LocomotionEnv("a1", 1, num_threads=1, faults=((1.0, lock("FR_calf")),), config=QUIET)
+    env.world.bind("xfrc_applied")  # the trunk carries an extra 20 kg
+    env.reset()
+    env.world.bind("xfrc_applied")[:, 1, 2] = -20 * 9.81
+    angle = env.joint_error[:, 0, 2]
+    rng = np.random.default_rng(0)
+    for _ in range(100):
+        env.step(rng.normal(size=(1, 12)))
+        angle = env.joint_error[0, 0, 2]
+        assert abs(angle) < 0.01
+    env.pin_faults([healthy()])
+    env.reset()
+    env.world.bind("xfrc_applied")[:] = 0
+    for _ in range(25):
+        env.step(np.full((1, 12), 0.8))
+    assert abs(env.joint_error[0, 0, 2]) > 0.1
+
+
+def test_disabled_motor_gives_no_torque_but_its_joint_moves():
+    env = LocomotionEnv("a1", 2, num_threads=1, config=QUIET)
+    env.pin_faults([disable("RL_thigh"), healthy()])
+    env.reset()
+    rng, moved = np.random.default_rng(0), 0.0
+    for _ in range(50):
+        env.step(rng.normal(size=(2, 12)))
+        assert env.torque[0, 3, 1] == 0.0
+        assert env.torque[1, 3, 1] != 0.0
+        moved = max(moved, abs(env.joint_error[0, 3, 1]))
+    assert moved > 0.1
+
+
+def test_weak_motor_gives_its_share_of_the_torque():
+    """Same state, same target: half the strength is half the force, and half the clipping limit."""
+    env = LocomotionEnv("a1", 2, num_threads=1, config=QUIET)
+    env.pin_faults([weaken("FL", 0.5), healthy()])
+    env.reset()
+    for action in (0.5, 10.0):  # 10: 2.5 rad away, 50 N m asked of 33.5
+        env.world.bind("ctrl")[:] = (env._default + 0.25 * action).reshape(-1)
+        env.world.forward(stage=mujoco.mjtStage.mjSTAGE_ACC)
+        weak, strong = env.torque
+        assert weak[1] == pytest.approx(0.5 * strong[1])
+        assert weak[0] == pytest.approx(strong[0])
+    assert strong[1].max() == pytest.approx(33.5)
+
+
+def test_reset_undoes_every_fault():
+    """After faults of all kinds, a healthy robot's model fields are the healthy model's, to the bit."""
+    env = LocomotionEnv("a1", 3, num_threads=1)
+    env.pin_faults([lock("FR_calf"), disable("FL_thigh"), weaken("RR", 0.3)])
+    env.reset()
+    env.pin_faults([healthy()] * 3)
+    env.reset()
+    assert not env.world.bind("eq_active").any()
+    for field in ("actuator_gainprm", "actuator_biasprm", "actuator_forcerange"):
+        assert np.array_equal(env.world.expanded(field), np.stack([getattr(env.model, field)] * 3))
+
+
+def test_training_faults_are_drawn_with_their_odds():
+    env = LocomotionEnv("a1", 400, seed=3, num_threads=1, faults=TASKS["stiffness"].training)
+    env.reset()
+    locked = env.world.bind("eq_active")[:, 2] > 0
+    assert 160 < locked.sum() < 240  # 200 +- 4 sd
+    assert np.array_equal(env.world.bind("eq_active").sum(axis=1), locked)  # nothing else is locked
+
+
+def test_fault_names_read_back():
+    for fault in (healthy(), lock("FR_calf"), disable("FL_hip"), weaken("RL", 0.25), lock("FR_calf") + weaken("RL", 0.5)):
+        assert parse(str(fault)) == fault
+    assert motor_strength(lock("FR_calf") + weaken("RL", 0.5), A1).tolist() == [1, 1, 0] + [1] * 6 + [0.5] * 3
+    assert healthy() == Fault()
+
+
+@pytest.mark.parametrize("text", ["", "lock", "lock:", "weaken:RL", "weaken:RL:x", "weaken:RL:2", "weaken:RL:nan", "melt:FR"])
+def test_unreadable_faults_are_refused(text):
+    with pytest.raises(ValueError, match="lock:FR_calf|no joint"):
+        motor_strength(parse(text), A1)
+
+
+def test_fault_of_a_part_that_is_not_there_is_refused():
+    with pytest.raises(ValueError, match="no joint or leg 'MR_calf'; it has the legs FR, FL, RR, RL"):
+        motor_strength(lock("MR_calf"), A1)

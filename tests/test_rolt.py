@@ -1,0 +1,137 @@
+"""ROLT's symmetries and its dropout."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from env import Observation
+from robots import A1
+from rolt import POLICIES, ROLT, ROLTConfig, drop, make_policy
+
+
+def observation(n=5, legs=4, seed=0):
+    g = torch.Generator().manual_seed(seed)
+    shapes = (n, legs, 10, 21), (n, 3 * legs), (n, 16, 12)
+    return Observation(*(torch.randn(*shape, generator=g) for shape in shapes))
+
+
+def model(seed=0, **switches):
+    torch.manual_seed(seed)
+    policy = ROLT(4, 3, replace(ROLTConfig(), **switches))
+    torch.nn.init.normal_(policy.decoder.weight)  # the small initial one would hide differences
+    return policy
+
+
+def masks_of(policy, n=5, seed=1):
+    return policy.sample_masks(n, torch.Generator().manual_seed(seed))
+
+
+def test_permuting_the_legs_permutes_the_actions():
+    """The legs share every weight; the action token is the same for all of them."""
+    policy, obs, order = model(), observation(), torch.tensor([2, 0, 3, 1])
+    actions = policy(obs).view(5, 4, 3)
+    permuted = policy(obs._replace(legs=obs.legs[:, order])).view(5, 4, 3)
+    assert torch.allclose(permuted, actions[:, order], atol=1e-5)
+    assert (actions[:, 0] - actions[:, 1]).abs().max() > 0.1  # legs that see different things act differently
+
+
+def test_module_pe_tells_the_legs_apart():
+    policy, obs, order = model(leg_pe=True), observation(), torch.tensor([2, 0, 3, 1])
+    actions = policy(obs).view(5, 4, 3)
+    permuted = policy(obs._replace(legs=obs.legs[:, order])).view(5, 4, 3)
+    assert (permuted - actions[:, order]).abs().max() > 1e-3
+    same = obs._replace(legs=obs.legs[:, :1].expand(-1, 4, -1, -1))  # legs that see the same
+    assert (policy(same).view(5, 4, 3)[:, 0] - policy(same).view(5, 4, 3)[:, 1]).abs().max() > 1e-3
+    assert torch.allclose(model()(same).view(5, 4, 3)[:, 0], model()(same).view(5, 4, 3)[:, 1], atol=1e-5)
+
+
+def test_only_rolt_reads_the_action_token():
+    obs = observation()
+    other = obs._replace(action=obs.action + 1)
+    assert not torch.allclose(model()(obs), model()(other))
+    assert torch.equal(model(leg_pe=True)(obs), model(leg_pe=True)(other))
+
+
+def test_pruned_last_layer_equals_the_full_one():
+    policy, obs = model(), observation()
+    policy.eval()
+    x = policy.tokens(obs, None)
+    for layer in policy.encoder:
+        x, _ = layer(x, x.shape[1], None, None)  # all tokens, also those that nobody reads
+    full = policy.decoder(policy.norm(x[:, :4])).flatten(1)
+    assert torch.allclose(policy(obs), full, atol=1e-5)
+
+
+def test_masks_have_their_rates():
+    policy = model()
+    masks = masks_of(policy, n=400)
+    assert {name: tuple(mask.shape[1:]) for name, mask in masks.items()} == {
+        "patch_position": (12,),
+        "attention_0": (17, 160), "feedforward_0": (17, 160), "attention_1": (4, 160), "feedforward_1": (4, 160),
+    }  # fmt: skip
+    for name, mask in masks.items():
+        rate, n = (0.75 if name == "patch_position" else 0.1), mask.numel()
+        assert abs((~mask).float().mean() - rate) < 5 * (rate * (1 - rate) / n) ** 0.5
+    assert masks_of(model(feature_dropout=0.0)).keys() == {"patch_position"}
+    assert "patch_position" not in masks_of(model(pe_dropout=0.0))
+
+
+def test_drop_scales_what_it_keeps():
+    x = torch.full((2, 3), 9.0)
+    keep = torch.tensor([[True, False, True], [False, True, True]])
+    assert torch.allclose(drop(x, keep, 0.1), torch.tensor([[10.0, 0, 10], [0, 10, 10]]))
+    assert drop(x, None, 0.1) is x
+
+
+def test_masks_change_the_action_and_repeat_it():
+    policy, obs = model(), observation()
+    masks = masks_of(policy)
+    assert torch.equal(policy(obs, masks), policy(obs, masks))
+    assert not torch.allclose(policy(obs, masks), policy(obs, masks_of(policy, seed=2)))
+    everything = {name: torch.ones_like(mask) for name, mask in masks.items()}
+    plain = model(feature_dropout=0.0)  # the same weights
+    assert torch.allclose(plain(obs, {"patch_position": everything["patch_position"]}), policy(obs), atol=1e-5)
+
+
+def test_dropped_positions_are_replaced_by_the_one_vector():
+    policy, obs = model(), observation()
+    keep = torch.zeros(5, 12, dtype=torch.bool)
+    keep[:, 3] = True
+    tokens, clean = policy.tokens(obs, {"patch_position": keep}), policy.tokens(obs, None)
+    change = tokens[:, 5:] - clean[:, 5:]  # tokens: 4 legs, 1 action, 12 patches
+    assert torch.allclose(change[:, 3], torch.zeros(5, 160))
+    assert torch.allclose(change[:, 7], (policy.dropped_position - policy.patch_position[7]).expand(5, -1), atol=1e-6)
+    policy(obs, {"patch_position": keep}).sum().backward()
+    assert policy.dropped_position.grad.abs().sum() > 0
+    assert torch.equal(policy.patch_position.grad[7], torch.zeros(160))
+
+
+def test_patches_are_neighbouring_points():
+    """Raising the 4 x 4 points of rows 4-7, columns 8-11 changes patch (1, 2), number 1 * 3 + 2, alone."""
+    policy, obs = model(), observation()
+    heights = obs.heights.clone()
+    heights[:, 4:8, 8:12] += 1
+    change = (policy.tokens(obs._replace(heights=heights), None) - policy.tokens(obs, None)).abs().sum((0, 2))
+    assert change.nonzero().flatten().tolist() == [5 + 5]
+
+
+def test_attention_is_a_distribution_over_tokens():
+    weights = model().attention(observation())
+    assert weights.shape == (5, 2, 4, 4, 17)  # B, layers, heads, legs, tokens
+    assert torch.allclose(weights.sum(-1), torch.ones(5, 2, 4, 4))
+
+
+@pytest.mark.parametrize("name", POLICIES)
+def test_every_weight_gets_a_gradient(name):
+    policy, obs = make_policy(name, A1), observation()
+    (policy(obs, masks_of(policy)).square().sum() + policy.sigma().sum()).backward()
+    idle = [n for n, p in policy.named_parameters() if p.grad is None]
+    assert idle == (["dropped_position"] if name == "no-pe-drop" else [])
+
+
+def test_a_leg_of_two_joints_and_six_legs_work_as_well():
+    policy = ROLT(6, 2)
+    obs = Observation(torch.randn(3, 6, 10, 18), torch.randn(3, 12), torch.randn(3, 16, 12))
+    assert policy(obs, policy.sample_masks(3, torch.Generator())).shape == (3, 12)
+    assert policy.sigma().shape == (12,)
