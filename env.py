@@ -63,7 +63,8 @@ class EnvConfig:
     command_seconds: float = 10.0  # legged_gym: then a new command
     forward_speed: tuple[float, float] = (0.0, 1.0)  # m/s; ours: the tests walk forward (legged_gym: -1 to 1)
     lateral_speed: tuple[float, float] = (0.0, 0.0)  # m/s; ours, likewise
-    heading: tuple[float, float] = (-np.pi, np.pi)  # rad, legged_gym's heading mode
+    heading: tuple[float, float] = (-0.5, 0.5)  # rad, legged_gym's heading mode; ours: enough to hold a course, and
+    # early on a robot that stands is paid for not turning (legged_gym: -pi to pi, where it is paid next to nothing)
     friction: tuple[float, float] = (0.5, 1.25)  # legged_gym
     start_pose: tuple[float, float] = (0.5, 1.5)  # times the default joint angles, legged_gym
     start_speed: float = 0.5  # m/s and rad/s, each component of the trunk's velocity within +-, legged_gym
