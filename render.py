@@ -54,13 +54,13 @@ def film(
         model.geom_rgba[model.geom_bodyid == model.body(env.robot.joints[joint]).id] = [0.85, 0.2, 0.15, 1]
     renderer = make_renderer(model, width, height)
     data, camera, frames = mujoco.MjData(model), mujoco.MjvCamera(), []
-    camera.distance, camera.azimuth, camera.elevation = 1.5, 120, -15
+    camera.distance, camera.azimuth, camera.elevation = 1.3, 125, -18
     start = round(warm_up / CONTROL_DT)
     for step in range(start + round(seconds / CONTROL_DT)):
         if step >= start and (step - start) % every == 0:
             data.qpos[:] = env.world.bind("qpos")[0]
             mujoco.mj_forward(model, data)
-            camera.lookat[:] = [data.qpos[0], data.qpos[1], 0.2]
+            camera.lookat[:] = [data.qpos[0], data.qpos[1], 0.18]
             renderer.update_scene(data, camera)
             frames.append(renderer.render().copy())
         observation, _, terminated, _, _ = env.step(policy(to_tensors(observation, "cpu")).numpy())

@@ -88,6 +88,10 @@ def build_model(robot: Robot) -> mujoco.MjModel:
     _add_world(spec)
     trunk = spec.worldbody.add_body(name="trunk", pos=[0, 0, robot.start_height])
     trunk.add_freejoint(name="root")
+    trunk.add_light(
+        type=mujoco.mjtLightType.mjLIGHT_SPOT, mode=mujoco.mjtCamLight.mjCAMLIGHT_TRACK, pos=[-0.6, -0.8, 2.5],
+        dir=[0.24, 0.32, -1], cutoff=60, exponent=1, diffuse=[0.6, 0.6, 0.6],
+    )  # fmt: skip
     _set_inertia(trunk, robot.trunk_mass, robot.trunk_com, robot.trunk_inertia)
     _add_geom(spec, trunk, "trunk", mujoco.mjtGeom.mjGEOM_BOX, np.array(robot.trunk_box) / 2)
 
@@ -130,15 +134,17 @@ def build_model(robot: Robot) -> mujoco.MjModel:
 
 
 def _add_world(spec: mujoco.MjSpec) -> None:
-    """Ground, light and a checkered material (for pictures)."""
+    """Ground, and light, sky and colours for pictures."""
+    texture, builtin = mujoco.mjtTexture, mujoco.mjtBuiltin
     spec.visual.global_.offwidth, spec.visual.global_.offheight = 1280, 720
-    spec.add_texture(
-        name="checker", type=mujoco.mjtTexture.mjTEXTURE_2D, builtin=mujoco.mjtBuiltin.mjBUILTIN_CHECKER,
-        rgb1=[0.86, 0.88, 0.90], rgb2=[0.78, 0.81, 0.84], width=256, height=256,
-    )  # fmt: skip
-    material = spec.add_material(name="ground", texrepeat=[1, 1], texuniform=True)
+    spec.visual.headlight.ambient, spec.visual.headlight.diffuse = [0.4, 0.4, 0.4], [0.2, 0.2, 0.2]
+    sky = {"type": texture.mjTEXTURE_SKYBOX, "builtin": builtin.mjBUILTIN_GRADIENT, "rgb1": [1, 1, 1], "rgb2": [0.7, 0.8, 0.9]}
+    spec.add_texture(name="sky", width=128, height=128 * 6, **sky)
+    checker = {"type": texture.mjTEXTURE_2D, "builtin": builtin.mjBUILTIN_CHECKER}
+    checker |= {"rgb1": [0.88, 0.89, 0.91], "rgb2": [0.78, 0.81, 0.84]}
+    spec.add_texture(name="checker", width=256, height=256, **checker)
+    material = spec.add_material(name="ground", texrepeat=[2, 2], texuniform=True)  # squares of 0.25 m
     material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "checker"
-    spec.worldbody.add_light(pos=[0, 0, 4], dir=[0.2, 0.3, -1], type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL)
     spec.worldbody.add_geom(
         name="ground", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 0.05], material="ground", contype=1, conaffinity=0
     )
