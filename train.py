@@ -86,7 +86,7 @@ class Progress:
 
     def __init__(self, args, iteration: int, steps: int):
         self.args, self.path, self.start, self.first = args, args.out / "progress.csv", time.time(), steps
-        self.episodes = deque(maxlen=20)  # of the last iterations: (number, sum of returns, of lengths, falls)
+        self.recent = deque(maxlen=20)  # iterations, for figures of episodes, which end now and then
         rows = []
         if iteration and self.path.exists():  # drop what was logged after the checkpoint that we go on from
             with open(self.path, newline="") as file:
@@ -94,10 +94,12 @@ class Progress:
         with open(self.path, "w", newline="") as file:
             csv.writer(file).writerows(rows)
 
-    def log(self, row: dict, episodes: tuple[float, ...]) -> None:
+    def log(self, row: dict, sums: dict[str, float]) -> None:
         """Writes the row and prints the line (every tenth one if the output is not a terminal)."""
-        self.episodes.append(episodes)
-        number, returns, lengths, falls = (sum(column) for column in zip(*self.episodes))
+        self.recent.append(sums)
+        number, returns, lengths, falls = (
+            sum(sums[name] for sums in self.recent) for name in ("episodes", "returns", "lengths", "falls")
+        )
         recent = [x / number if number else math.nan for x in (returns, lengths * CONTROL_DT, falls)]
         row |= dict(zip(("episode_return", "episode_seconds", "falls"), recent))
         with open(self.path, "a", newline="") as file:
@@ -120,13 +122,36 @@ class Progress:
             print(line, flush=True)
 
 
+def sum_over_processes(figures: dict[str, float], device) -> dict[str, float]:
+    values = all_reduce(torch.tensor([float(x) for x in figures.values()], dtype=torch.float64, device=device))
+    return dict(zip(figures, values.tolist()))
+
+
+def summarise(infos: list[dict], buffer: RolloutBuffer, env: LocomotionEnv) -> tuple[dict, dict]:
+    """What a rollout was like on this process's robots: figures to average over processes, and figures to add up."""
+    means = {name: sum(i[name].mean() for i in infos) / len(infos) for name in ("speed", "commanded_speed")}
+    for term in REWARDS:
+        means[f"reward_{term.__name__}"] = sum(i["rewards"][term.__name__].mean() for i in infos) / len(infos)
+    sums = {
+        "episodes": sum(len(i["episode_returns"]) for i in infos),
+        "returns": sum(i["episode_returns"].sum() for i in infos),
+        "lengths": sum(i["episode_lengths"].sum() for i in infos),
+        "falls": buffer.terminated.sum(),
+        "divergences": env.divergences,
+    }
+    return means, sums
+
+
 def train(rank: int, args, sync: str | None) -> None:
     """The training loop of one process."""
+    device = torch.device("cpu")
+    if args.device == "cuda":
+        device = torch.device("cuda", int(os.environ.get("LOCAL_RANK", 0)))
+        torch.cuda.set_device(device)
     if args.processes > 1:
         backend = "nccl" if args.device == "cuda" else "gloo"
         dist.init_process_group(backend, init_method=sync, rank=rank, world_size=args.processes)
     torch.set_num_threads(1)
-    device = torch.device(args.device, int(os.environ.get("LOCAL_RANK", 0))) if args.device == "cuda" else torch.device("cpu")
     config = PPOConfig(epochs=args.epochs, minibatches=args.minibatches)
     threads = args.threads if args.device == "cuda" else 1
     faults = TASKS[args.task].training
@@ -137,7 +162,8 @@ def train(rank: int, args, sync: str | None) -> None:
     policy = make_policy(args.policy, env.robot).to(device)
     critic = Critic(observation).to(device)
     generator = torch.Generator(device).manual_seed(args.seed * 1_000_003 + rank)  # actions, masks, minibatches
-    buffer = RolloutBuffer(config.steps, observation, env.num_actions, policy.sample_masks(env.num_envs, generator), device)
+    masks = policy.sample_masks(env.num_envs, torch.Generator(device))  # only their shapes count here
+    buffer = RolloutBuffer(config.steps, observation, env.num_actions, masks, device)
     learner = Learner(policy, critic, config)
     iteration, steps = 0, 0
 
@@ -147,31 +173,27 @@ def train(rank: int, args, sync: str | None) -> None:
         policy.load_state_dict(saved["weights"])
         critic.load_state_dict(saved["critic"])
         learner.load_state_dict(saved["learner"])
-        env.load_state_dict(from_tensors(saved["processes"][rank]["env"]))
+        env.load_state_dict(from_plain(saved["processes"][rank]["env"]))
         generator.set_state(saved["processes"][rank]["generator"])
         observation = env.observe()
 
     def save() -> None:
-        """Rank 0 writes what it is told by all."""
+        """Process 0 writes the files; the others tell it their part."""
         mine = {"env": to_plain(env.state_dict()), "generator": generator.get_state()}
-        everyone = [None] * args.processes if rank == 0 else None
+        everyone = [mine] * args.processes
         if args.processes > 1:
-            dist.gather_object(mine, everyone)
-        else:
-            everyone = [mine]
+            dist.gather_object(mine, everyone if rank == 0 else None)
         if rank == 0:
-            card = {key: getattr(args, key) for key in ("robot", "task", "policy", "seed")} | {"steps": steps}
-            weights = {name: tensor.cpu() for name, tensor in policy.state_dict().items()}
-            checkpoint.save(card | {"weights": weights}, args.out / "policy.pt")
-            more = {"critic": critic.state_dict(), "learner": learner.state_dict(), "processes": everyone}
-            identity = {key: getattr(args, key) for key in IDENTITY}
-            content = card | {"weights": weights, "iteration": iteration, "identity": identity}
-            checkpoint.save(content | more, args.out / "checkpoint.pt")
+            content = {key: getattr(args, key) for key in ("robot", "task", "policy", "seed")} | {"steps": steps}
+            content["weights"] = {name: tensor.cpu() for name, tensor in policy.state_dict().items()}
+            checkpoint.save(content, args.out / "policy.pt")
+            content |= {"critic": critic.state_dict(), "learner": learner.state_dict(), "processes": everyone}
+            content |= {"iteration": iteration, "identity": {key: getattr(args, key) for key in IDENTITY}}
+            checkpoint.save(content, args.out / "checkpoint.pt")
             learning_curve(args.out / "progress.csv", args.out / "progress.png")
 
     stop = []  # Ctrl-C and SIGTERM end the run after the iteration that they interrupt
-    for signum in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(signum, lambda *_: stop.append(True))
+    handlers = {n: signal.signal(n, lambda *_: stop.append(True)) for n in (signal.SIGINT, signal.SIGTERM)}
     progress = Progress(args, iteration, steps) if rank == 0 else None
     saved_at = time.time()
     while steps < args.steps:
@@ -182,31 +204,22 @@ def train(rank: int, args, sync: str | None) -> None:
         updated = time.perf_counter()
         iteration, steps = iteration + 1, steps + len(buffer) * args.processes
 
-        # sums over this process's robots and steps, then over all processes
-        terms = [torch.stack([torch.tensor(i["rewards"][term.__name__].mean()) for i in infos]).mean() for term in REWARDS]
-        returns = torch.tensor([x for i in infos for x in i["episode_returns"]], dtype=torch.float64)
-        lengths = torch.tensor([float(x) for i in infos for x in i["episode_lengths"]], dtype=torch.float64)
-        means = [sum(i[key].mean() for i in infos) / len(infos) for key in ("speed", "commanded_speed")] + terms
-        sums = [len(returns), returns.sum(), lengths.sum(), buffer.terminated.sum(), env.divergences]
-        overdue = time.time() - saved_at > 60 * args.save_minutes
-        flags = [float(bool(stop)), float(rank == 0 and overdue)]  # all processes must agree on these
-        shared = all_reduce(torch.tensor([float(x) for x in (*means, *sums, *flags)], dtype=torch.float64)).tolist()
-        speed, commanded, *terms = (x / args.processes for x in shared[: len(means)])
-        *episodes, divergences = shared[len(means) : -2]
-        must_stop, must_save = shared[-2] > 0, shared[-1] > 0
-
+        means, sums = summarise(infos, buffer, env)
+        overdue = rank == 0 and time.time() - saved_at > 60 * args.save_minutes
+        shared = sum_over_processes(means | sums | {"stop": bool(stop), "save": overdue}, device)  # all must agree
         if rank == 0:
-            row = {"iteration": iteration, "steps": steps, "speed": speed, "commanded_speed": commanded}
+            row = {"iteration": iteration, "steps": steps} | {name: shared[name] / args.processes for name in means}
             row |= {"sigma": policy.sigma().mean().item(), "learning_rate": learner.learning_rate} | losses
-            row |= {f"reward_{term.__name__}": value for term, value in zip(REWARDS, terms)}
-            row |= {"divergences": int(divergences), "collect_seconds": collected - started}
-            progress.log(row | {"update_seconds": updated - collected}, tuple(episodes))
-        if must_save or must_stop or steps >= args.steps:
+            row |= {"collect_seconds": collected - started, "update_seconds": updated - collected}
+            progress.log(row | {"divergences": int(shared["divergences"])}, shared)
+        if shared["save"] or shared["stop"] or steps >= args.steps:
             save()
             saved_at = time.time()
-        if must_stop:
+        if shared["stop"]:
             break
 
+    for number, handler in handlers.items():
+        signal.signal(number, handler)
     if rank == 0:
         policy_file = args.out / "policy.pt"
         if steps < args.steps:
@@ -223,10 +236,10 @@ def to_plain(value):
     return torch.from_numpy(value) if hasattr(value, "__array__") else value
 
 
-def from_tensors(value):
+def from_plain(value):
     """The inverse of `to_plain`."""
     if isinstance(value, dict):
-        return {key: from_tensors(item) for key, item in value.items()}
+        return {key: from_plain(item) for key, item in value.items()}
     return value.numpy() if isinstance(value, torch.Tensor) else value
 
 
