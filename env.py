@@ -51,7 +51,7 @@ SCAN_SHAPE = (16, 12)  # points forward, left; 12 patches of 4 x 4 (the paper gi
 MAX_ACTION = 10.0  # ours: 2.5 rad from the default pose reaches every joint limit
 MAX_TILT = np.cos(np.deg2rad(60))  # ours: past 60 degrees no robot here gets up again; legged_gym waits for contact
 SAVED_ARRAYS = (
-    "action", "last_action", "history", "command", "heading", "air_time", "age", "episode_return", "fault_index",
+    "action", "last_action", "history", "command", "heading", "air_time", "age", "episode_return", "fault_index", "_last_contact",
 )  # fmt: skip
 
 
@@ -131,7 +131,7 @@ class LocomotionEnv:
         self.action, self.last_action = np.zeros(shape), np.zeros(shape)
         self.history = np.zeros((num_envs, self.num_legs, HISTORY, 12 + 3 * self.num_joints), dtype=np.float32)
         self.command, self.heading = np.zeros((num_envs, 3)), np.zeros(num_envs)
-        self.air_time = np.zeros((num_envs, self.num_legs))
+        self.air_time, self._last_contact = np.zeros(shape[:2]), np.zeros(shape[:2], dtype=bool)
         self.age = np.zeros(num_envs, dtype=int)  # (N,) steps since reset
         self.episode_return = np.zeros(num_envs)
         self.divergences = 0  # simulations that MuJoCo gave up, in total
@@ -228,7 +228,7 @@ class LocomotionEnv:
         self.world.forward(ids, stage=mujoco.mjtStage.mjSTAGE_VEL)
 
         self.action[ids] = self.last_action[ids] = 0.0
-        self.air_time[ids] = 0.0
+        self.air_time[ids], self._last_contact[ids] = 0.0, False
         self.age[ids] = 0
         self.episode_return[ids] = 0.0
         self._read_state()
@@ -304,8 +304,11 @@ class LocomotionEnv:
         self.link_contact = self._contacts[:, self._link_sensors] > 0
 
     def _read_feet(self) -> None:
-        """A touchdown is a contact of a foot that was in the air one step ago."""
-        self.foot_contact = self._contacts[:, self._foot_sensors] > 0
+        """Contacts, held for one step: a foot that leaves the ground for a single one has not taken a step
+        (legged_gym). A touchdown is a contact of a foot that was in the air."""
+        contact = self._contacts[:, self._foot_sensors] > 0
+        self.foot_contact = contact | self._last_contact
+        self._last_contact = contact
         self.touchdown = self.foot_contact & (self.air_time > 0)
         self.air_time += CONTROL_DT
 
