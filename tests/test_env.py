@@ -95,6 +95,25 @@ def test_steering_follows_the_heading():
     assert abs(env.command[3, 2]) == 1.0
 
 
+def test_a_command_lasts_through_falls_and_changes_between_episodes_only():
+    env = LocomotionEnv("a1", 2, num_threads=1, config=EnvConfig(episode_seconds=0.2, command_seconds=0.1, start_speed=0.0))
+    env.reset()
+    first = env.command[:, 0].copy()
+    for _ in range(3):
+        env.step(np.zeros((2, 12)))
+    env._qpos[0, 3:7] = [0, 1, 0, 0]  # robot 0 falls before its command is 5 steps old: it tries again
+    assert env.step(np.zeros((2, 12)))[2][0]
+    assert np.array_equal(env.command[:, 0], first)
+    for _ in range(5):
+        env.step(np.zeros((2, 12)))
+        assert np.array_equal(env.command[:, 0], first)  # old by now, but not within an episode
+    env.step(np.zeros((2, 12)))  # robot 1's time is up
+    assert env.command[0, 0] == first[0] and env.command[1, 0] != first[1]
+    env._qpos[0, 3:7] = [0, 1, 0, 0]  # robot 0 falls with an old command
+    env.step(np.zeros((2, 12)))
+    assert env.command[0, 0] != first[0]
+
+
 def test_timeout_gives_the_true_last_observation_and_restarts():
     env = LocomotionEnv("a1", 2, num_threads=1, config=EnvConfig(episode_seconds=5 * CONTROL_DT, start_speed=0.0))
     env.reset()
