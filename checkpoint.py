@@ -2,10 +2,10 @@
 
 Two kinds, both of torch.save, both dictionaries of plain values and tensors:
     policy.pt      the policy's weights and what they are for (robot, task, policy, steps, seed); about 2 MB. This is
-                   what evaluate.py reads and what checkpoints/ holds.
+                   what evaluate.py reads, and the kind of file for checkpoints/.
     checkpoint.pt  the same and everything else that training needs to go on: `train.py --resume`.
 
-    >>> policy, card = load_policy("checkpoints/a1-stiffness-rolt.pt")
+    >>> policy, card = load_policy("runs/a1-stiffness-rolt-seed0/policy.pt")
 """
 
 import os

@@ -1,7 +1,7 @@
 """Trains a policy: PPO on every core, or on a GPU.
 
-    python train.py --robot a1                            # ROLT on the stiffness task, about an hour on two cores
-    python train.py --robot a1 --steps 20000              # does it run? half a minute
+    python train.py --robot a1                            # ROLT on the stiffness task, a few hours on two cores
+    python train.py --robot a1 --steps 20000              # does it run? a minute
     python train.py --robot a1 --resume                   # goes on where it was stopped (Ctrl-C is safe)
     python train.py --robot a1 --paper --device cuda      # the paper's size: 4096 robots, 400 million steps
 
@@ -112,7 +112,8 @@ class Progress:
         rate = (steps - self.first) / (time.time() - self.start)
         bar = "#" * int(20 * min(1, steps / total))
         line = (
-            f"[{bar:.<20}] {steps / 1e6:.2f}/{total / 1e6:.2f}M {rate:,.0f}/s {max(0, total - steps) / rate / 60:.0f} min left"
+            f"[{bar:.<20}] {steps / 1e6:.2f}/{total / 1e6:.2f}M {rate:,.0f}/s"
+            f" {max(0, total - steps) / rate / 60:.0f} min left"
             f" | return {recent[0]:.1f} speed {row['speed']:.2f} of {row['commanded_speed']:.2f} m/s"
             f" episode {recent[1]:.1f} s falls {recent[2]:.0%} sigma {row['sigma']:.2f} KL {row['kl']:.3f}"
         )
@@ -259,7 +260,8 @@ def main(argv: list[str] | None = None) -> None:
             identity = checkpoint.load(args.out / "checkpoint.pt").get("identity", {})
         except checkpoint.CheckpointError as error:
             fail(error)
-        differing = [f"{key} was {identity.get(key)}, is {getattr(args, key)}" for key in IDENTITY if identity.get(key) != getattr(args, key)]
+        pairs = {key: (identity.get(key), getattr(args, key)) for key in IDENTITY}
+        differing = [f"{key} was {was}, is {now}" for key, (was, now) in pairs.items() if was != now]
         if differing:
             fail(f"the run in {args.out} was another one: {'; '.join(differing)}")
     if "RANK" in os.environ:  # started by torchrun, which has made the processes
