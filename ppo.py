@@ -27,7 +27,7 @@ MICRO_BATCH = 128  # samples a forward pass on a CPU, ours: the activations stay
 @dataclass(frozen=True)
 class PPOConfig:
     steps: int = 24  # T, control steps of an iteration, legged_gym
-    epochs: int = 3  # ours: a laptop's time is better spent on new data (legged_gym: 5); with 1 ROLT got worse
+    epochs: int = 3  # ours: a laptop's time is better spent on new data (legged_gym: 5)
     minibatches: int = 6  # an epoch, ours: of 1024 samples at 256 robots (legged_gym: 4 of 24576 at 4096)
     discount: float = 0.99  # gamma, legged_gym
     gae_lambda: float = 0.95  # legged_gym
