@@ -9,17 +9,28 @@ What a policy sees (`Observation`); scales are legged_gym's:
 
     symbol     shape            meaning                                                            scale
     legs       (N, L, H, 21)    s^l of eq. 1: what each leg saw in the past 10 steps, oldest first
-      0:3                       joint position - default pose, hip thigh calf [rad]                1
+      0:3                       joint position, hip thigh calf [rad]                               1
       3:6                       joint velocity [rad/s]                                             0.05
-      6:9                       previous action of the leg's joints                                1
+      6:9                       previous target angle of the leg's joints [rad]                    1
       9:12                      velocity command forward, left [m/s], yaw [rad/s]                  2, 2, 0.25
       12:15                     trunk linear velocity in the trunk's frame [m/s]                   2
       15:18                     trunk angular velocity in the trunk's frame [rad/s]                0.25
       18:21                     direction of gravity in the trunk's frame                          1
-    action     (N, L*J)         a_{t-1} of eq. 2, the previous action of all joints                1
+    action     (N, L*J)         a_{t-1} of eq. 2, the previous target angles of all joints [rad]   1
     heights    (N, 16, 12)      s_e: clip(trunk z - 0.5 m - ground z, -1, 1) at points 0.1 m       5
                                 apart around the robot, rows forward, columns left, turning with
                                 its yaw (the ground is flat so far)
+
+Angles are absolute, as the paper writes ("joints' position", "the last output target angles"; legged_gym subtracts the
+default pose). It matters: the default pose is not the same on every leg (the A1's hips are turned outwards, to
+-0.1 right and +0.1 left), so ROLT can tell left from right from the start. With differences it had to
+find that out from noise, and stood still, unable to turn, for 0.8 million steps.
+
+And what only some baselines read, empty (N, 0) unless named in `extras`:
+
+    privileged (N, 2*L*J + 1)   is the joint locked, its motor's strength, the friction               1
+    past       (N, L, 50, 21)   as `legs`, 50 steps long                                           as above
+    situation  (N, 1)           index of the robot's fault among the env's `faults`                   1
 
 What rewards and users may read after a step (attributes of the env):
 
@@ -47,6 +58,9 @@ from robots import PHYSICS_DT, ROBOTS, Robot, build_model
 SUBSTEPS = 4  # legged_gym: 50 Hz control
 CONTROL_DT = SUBSTEPS * PHYSICS_DT  # s
 HISTORY = 10  # steps (paper, section III-A)
+LONG_HISTORY = 50  # steps that RMA's adaptation reads (Kumar et al. 2021)
+EXTRAS = ("privileged", "past", "situation")
+HEIGHT_SCALE = 5.0  # legged_gym
 SCAN_SHAPE = (16, 12)  # points forward, left; 12 patches of 4 x 4 (the paper gives 12 patches, the points are ours)
 MAX_ACTION = 10.0  # ours: 2.5 rad from the default pose reaches every joint limit
 MAX_TILT = np.cos(np.deg2rad(60))  # ours: past 60 degrees no robot here gets up again; legged_gym waits for contact
@@ -83,6 +97,9 @@ class Observation(NamedTuple):
     legs: np.ndarray  # (N, L, H, 21)
     action: np.ndarray  # (N, L*J)
     heights: np.ndarray  # (N, 16, 12)
+    privileged: np.ndarray  # (N, 2*L*J + 1) or (N, 0)
+    past: np.ndarray  # (N, L, 50, 21) or (N, 0)
+    situation: np.ndarray  # (N, 1) or (N, 0)
 
 
 class LocomotionEnv:
@@ -90,6 +107,7 @@ class LocomotionEnv:
 
     faults: (probability, fault) pairs; each reset draws one. `pin_faults` fixes one a robot instead.
     num_threads: of the simulator, 0 = one a core. Results do not depend on it.
+    extras: which of privileged, past and situation the observation holds. None of them changes the simulation.
     """
 
     def __init__(
@@ -100,13 +118,16 @@ class LocomotionEnv:
         num_threads: int = 0,
         faults: tuple[tuple[float, Fault], ...] = ((1.0, healthy()),),
         config: EnvConfig = EnvConfig(),
+        extras: tuple[str, ...] = (),
     ):
         if isinstance(robot, str) and robot not in ROBOTS:
             raise ValueError(f"unknown robot {robot!r}; there is {', '.join(ROBOTS)}")
         if num_envs < 1:
             raise ValueError(f"num_envs is at least 1, not {num_envs}")
         self.robot = robot = ROBOTS[robot] if isinstance(robot, str) else robot
-        self.num_envs, self.config = num_envs, config
+        if unknown := set(extras) - set(EXTRAS):
+            raise ValueError(f"unknown extras {', '.join(sorted(unknown))}; there is {', '.join(EXTRAS)}")
+        self.num_envs, self.config, self.extras = num_envs, config, extras
         self.num_legs, self.num_joints = len(robot.legs), len(robot.links)
         self.num_actions = self.num_legs * self.num_joints
         self.episode_steps = round(config.episode_seconds / CONTROL_DT)
@@ -131,7 +152,8 @@ class LocomotionEnv:
 
         shape = (num_envs, self.num_legs, self.num_joints)
         self.action, self.last_action = np.zeros(shape), np.zeros(shape)
-        self.history = np.zeros((num_envs, self.num_legs, HISTORY, 12 + 3 * self.num_joints), dtype=np.float32)
+        memory = LONG_HISTORY if "past" in extras else HISTORY
+        self.history = np.zeros((num_envs, self.num_legs, memory, 12 + 3 * self.num_joints), dtype=np.float32)
         self.command, self.heading = np.zeros((num_envs, 3)), np.zeros(num_envs)
         self.air_time, self._last_contact = np.zeros(shape[:2]), np.zeros(shape[:2], dtype=bool)
         self.age = np.zeros(num_envs, dtype=int)  # (N,) steps since reset
@@ -177,7 +199,7 @@ class LocomotionEnv:
         if not np.isfinite(action).all():
             raise ValueError("an action is not finite: the policy that made it has diverged")
         self.last_action, self.action = self.action, np.clip(action, -MAX_ACTION, MAX_ACTION)
-        self._ctrl[:] = (self._default + self.robot.action_scale * self.action).reshape(self.num_envs, -1)
+        self._ctrl[:] = self._target().reshape(self.num_envs, -1)
         self.world.step(nstep=SUBSTEPS, stage=mujoco.mjtStage.mjSTAGE_VEL)
         self.age += 1
         self.command_age += 1
@@ -209,8 +231,15 @@ class LocomotionEnv:
 
     def observe(self) -> Observation:
         """The current observation (a copy)."""
-        action = self.action.reshape(self.num_envs, -1).astype(np.float32)
-        return Observation(self.history.copy(), action, self._scan())
+        target = self._target().reshape(self.num_envs, -1).astype(np.float32)
+        extra = {name: np.zeros((self.num_envs, 0), dtype=np.float32) for name in EXTRAS}
+        if "privileged" in self.extras:
+            extra["privileged"] = self._privileged()
+        if "past" in self.extras:
+            extra["past"] = self.history.copy()
+        if "situation" in self.extras:
+            extra["situation"] = self.fault_index[:, None].astype(np.float32)
+        return Observation(self.history[:, :, -HISTORY:].copy(), target, self._scan(), **extra)
 
     # ------------------------------------------------------------------ episode
 
@@ -239,7 +268,7 @@ class LocomotionEnv:
         self._read_state()
         self._resample_commands(ids[self.command_age[ids] >= round(config.command_seconds / CONTROL_DT)])
         self._steer()
-        self.history[ids] = self._frame()[ids, :, None]  # as though it had stood like this for the past 10 steps
+        self.history[ids] = self._frame()[ids, :, None]  # as though it had always stood like this
 
     def _resample_commands(self, ids: np.ndarray) -> None:
         """A forward and a lateral speed, and a heading, for each of the robots `ids`."""
@@ -318,20 +347,31 @@ class LocomotionEnv:
         self.touchdown = self.foot_contact & (self.air_time > 0)
         self.air_time += CONTROL_DT
 
+    def _target(self) -> np.ndarray:
+        """(N, L, J) rad, the joint angles that the action asks for."""
+        return self._default + self.robot.action_scale * self.action
+
     def _frame(self) -> np.ndarray:
         """(N, L, 21), the newest step of every leg's history."""
         body = np.concatenate(
             [self.command * (2, 2, 0.25), self.linear_velocity * 2, self.angular_velocity * 0.25, self.gravity], axis=1
         )  # (N, 12)
         body = np.broadcast_to(body[:, None], (self.num_envs, self.num_legs, 12))
-        frame = np.concatenate([self.joint_error, self.joint_velocity * 0.05, self.action, body], axis=2)
+        position = self._default + self.joint_error
+        frame = np.concatenate([position, self.joint_velocity * 0.05, self._target(), body], axis=2)
         return frame.astype(np.float32)
 
     def _remember(self) -> None:
         self.history[:, :, :-1] = self.history[:, :, 1:]
         self.history[:, :, -1] = self._frame()
 
+    def _privileged(self) -> np.ndarray:
+        """(N, 2*L*J + 1), what no robot can measure."""
+        locked = self.world.bind("eq_active")
+        strength = self.world.expand("actuator_forcerange")[:, :, 1] / self.model.actuator_forcerange[:, 1]
+        return np.concatenate([locked, strength, self._friction[:, 0, :1]], axis=1).astype(np.float32)
+
     def _scan(self) -> np.ndarray:
         """(N, 16, 12) scandots. On flat ground every point is at z = 0, whichever way the grid is turned."""
-        height = np.clip(self._qpos[:, 2] - 0.5, -1, 1) * 5
+        height = HEIGHT_SCALE * np.clip(self._qpos[:, 2] - 0.5, -1, 1)
         return np.broadcast_to(height.astype(np.float32)[:, None, None], (self.num_envs, *SCAN_SHAPE)).copy()

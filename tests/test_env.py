@@ -8,6 +8,7 @@ import pytest
 import rewards
 from env import CONTROL_DT, EnvConfig, LocomotionEnv
 from faults import TASKS
+from robots import A1
 
 
 def rollout(threads=1, seed=0, steps=60):
@@ -54,9 +55,10 @@ def test_history_rolls_oldest_first_and_starts_filled():
         action = rng.normal(size=(3, 12))
         after, *_ = env.step(action)
         assert np.array_equal(after.legs[:, :, :-1], before[:, :, 1:])
-        assert np.allclose(after.legs[:, :, -1, 6:9], action.reshape(3, 4, 3))  # the leg's own previous action
-        assert np.allclose(after.action, action)
-        assert np.allclose(after.legs[:, :, -1, 0:3], env.joint_error)
+        target = np.array(A1.default_pose) + A1.action_scale * action.reshape(3, 4, 3)
+        assert np.allclose(after.legs[:, :, -1, 6:9], target)  # the leg's own previous target
+        assert np.allclose(after.action, target.reshape(3, 12))
+        assert np.allclose(after.legs[:, :, -1, 0:3], np.array(A1.default_pose) + env.joint_error)
         assert np.allclose(after.legs[:, :, -1, 3:6], 0.05 * env.joint_velocity)
         before = after.legs
 
