@@ -15,12 +15,12 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from baselines import make_policy
 from cli import Parser, count, num_cores
 from env import LocomotionEnv
 from faults import TASKS
 from ppo import MICRO_BATCH, to_tensors
 from robots import ROBOTS
-from rolt import make_policy
 
 
 def seconds(function) -> float:

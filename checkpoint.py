@@ -13,7 +13,8 @@ from pathlib import Path
 
 import torch
 
-from rolt import POLICIES, make_policy
+from baselines import METHODS, make_policy
+from faults import TASKS
 from robots import ROBOTS
 
 FORMAT = 1  # raise it when files of before can no longer be read
@@ -62,11 +63,12 @@ def load_policy(path: str | Path, robot: str | None = None) -> tuple[torch.nn.Mo
     if missing:
         raise CheckpointError(f"{path} holds no policy: {', '.join(missing)} is missing")
     card = {key: content[key] for key in CARD}
-    if card["robot"] not in ROBOTS or card["policy"] not in POLICIES:
-        raise CheckpointError(f"{path} is of a robot or policy unknown here: {card['robot']}, {card['policy']}")
+    if card["robot"] not in ROBOTS or card["policy"] not in METHODS or card["task"] not in TASKS:
+        what = f"{card['robot']}, {card['task']}, {card['policy']}"
+        raise CheckpointError(f"{path} is of a robot, task or policy unknown here: {what}")
     if robot is not None and card["robot"] != robot:
         raise CheckpointError(f"{path} was trained on the {card['robot']}, not on the {robot}")
-    policy = make_policy(card["policy"], ROBOTS[card["robot"]])
+    policy = make_policy(card["policy"], ROBOTS[card["robot"]], TASKS[card["task"]])
     try:
         policy.load_state_dict(content["weights"])
     except (RuntimeError, TypeError, AttributeError) as error:

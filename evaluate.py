@@ -14,13 +14,13 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from baselines import METHODS
 from checkpoint import CheckpointError, load_policy
 from cli import Parser, count, fail, num_cores, positive, seed, writable_folder
 from env import CONTROL_DT, EnvConfig, LocomotionEnv
 from faults import TASKS, Fault, healthy
 from plots import bar_charts
 from ppo import to_tensors
-from rolt import POLICIES
 
 COLUMNS = ("method", "checkpoint", "seed", "case", "episode", "distance_m", "fall_time_s", "episode_return")
 
@@ -41,7 +41,7 @@ def run_episodes(
         episode_seconds=seconds + 1.0,  # nobody times out before we stop
         forward_speed=(speed, speed), lateral_speed=(0.0, 0.0), heading=(0.0, 0.0), push_speed=0.0,
     )  # fmt: skip
-    env = LocomotionEnv(robot, len(faults), seed, threads, config=config)
+    env = LocomotionEnv(robot, len(faults), seed, threads, config=config, extras=policy.extras)
     env.pin_faults(faults)
     observation = env.reset()
     start, steps = env.position[:, 0].copy(), round(seconds / CONTROL_DT)
@@ -124,7 +124,7 @@ def find_policies(args) -> dict[Path, tuple]:
     if args.checkpoints:
         paths = args.checkpoints
     else:
-        wanted = args.methods or list(POLICIES)
+        wanted = args.methods or list(METHODS)
         shipped = Path(__file__).parent / "checkpoints"
         named = {method: shipped / f"{args.robot}-{args.experiment}-{method}.pt" for method in wanted}
         paths = [path for path in named.values() if path.is_file()]
@@ -142,7 +142,7 @@ def main(argv: list[str] | None = None) -> None:
     parser = Parser(__doc__)
     parser.add_argument("experiment", choices=EXPERIMENTS)
     parser.add_argument("--robot", default=None, help="default: the first one that the test is for")
-    parser.add_argument("--methods", nargs="+", choices=POLICIES, help="which shipped checkpoints (default: all)")
+    parser.add_argument("--methods", nargs="+", choices=METHODS, help="which shipped checkpoints (default: all)")
     parser.add_argument("--checkpoints", nargs="+", type=Path, metavar="FILE", help="policy files, instead of the shipped")
     parser.add_argument("--episodes", type=count, default=32, help="a case (default 32)")
     parser.add_argument("--seconds", type=positive, default=20.0, help="of an episode (default 20, the paper's)")

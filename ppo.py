@@ -19,7 +19,7 @@ import torch.distributed as dist
 from torch import Tensor, nn
 from torch.distributions import Normal, kl_divergence
 
-from env import LocomotionEnv, Observation
+from env import HEIGHT_SCALE, LocomotionEnv, Observation
 
 MICRO_BATCH = 128  # samples a forward pass on a CPU, ours: the activations stay in the cache (fastest of 64 to 1024)
 
@@ -45,13 +45,18 @@ class Critic(nn.Module):
 
     def __init__(self, observation: Observation):
         super().__init__()
-        sizes = [sum(field[0].size for field in observation), 512, 256, 128]
+        sizes = [sum(field[0].size for field in seen(observation)), 512, 256, 128]
         layers = [module for a, b in zip(sizes, sizes[1:]) for module in (nn.Linear(a, b), nn.ELU())]
         self.network = nn.Sequential(*layers, nn.Linear(sizes[-1], 1))
 
     def forward(self, observation: Observation) -> Tensor:
         """(B,) value of each observation."""
-        return self.network(torch.cat([field.flatten(1) for field in observation], dim=1)).squeeze(1)
+        return self.network(torch.cat([field.flatten(1) for field in seen(observation)], dim=1)).squeeze(1)
+
+
+def seen(observation: Observation) -> tuple:
+    """What a critic reads: all but RMA's long history and ROAM's label."""
+    return observation.legs, observation.action, observation.heights, observation.privileged
 
 
 # ---------------------------------------------------------------------- masks as bits
@@ -125,6 +130,9 @@ def collect(
     buffer.sigma.copy_(policy.sigma())
     for t in range(len(buffer.reward)):
         observation = to_tensors(observation, device)
+        if policy.height_noise:  # in the buffer too: the update must see what the rollout saw
+            noise = torch.randn(observation.heights.shape, generator=generator, device=device)
+            observation = observation._replace(heights=observation.heights + HEIGHT_SCALE * policy.height_noise * noise)
         masks = policy.sample_masks(env.num_envs, generator)
         mean = policy(observation, masks)
         noise = torch.randn(mean.shape, generator=generator, device=device)
@@ -132,8 +140,8 @@ def collect(
 
         for stored, field in zip(buffer.observation, observation):
             stored[t] = field
-        for name, mask in masks.items():
-            buffer.masks[name][t] = pack_bits(mask)
+        for name in buffer.masks:
+            buffer.masks[name][t] = pack_bits(masks[name])
         buffer.action[t], buffer.mean[t], buffer.value[t] = action, mean, critic(observation)
         buffer.log_prob[t] = gaussian(mean, buffer.sigma).log_prob(action).sum(-1)
 
@@ -211,23 +219,29 @@ def all_reduce(tensor: Tensor) -> Tensor:
 
 
 class Learner:
-    """Policy, critic and optimiser. Each process holds a copy and its own samples; gradients are summed over all."""
+    """Policy, critic and optimiser. Each process holds a copy and its own samples; gradients are summed over all.
 
-    def __init__(self, policy, critic: Critic, config: PPOConfig):
+    Trains the parameters that require a gradient. The baselines' later stages (baselines.py) override `loss`.
+    """
+
+    STATS = ("surrogate", "value_loss", "clip_fraction", "kl", "other_loss")  # what `update` reports
+
+    def __init__(self, policy, critic: nn.Module, config: PPOConfig):
         self.policy, self.critic, self.config = policy, critic, config
-        self.named_parameters = [*policy.named_parameters(), *((f"critic.{n}", p) for n, p in critic.named_parameters())]
+        named = [*policy.named_parameters(), *((f"critic.{n}", p) for n, p in critic.named_parameters())]
+        self.named_parameters = [(name, p) for name, p in named if p.requires_grad]
         parameters = [p for _, p in self.named_parameters]
         groups = [
-            {"params": list(policy.parameters()), "lr": config.learning_rate},
-            {"params": list(critic.parameters()), "lr": config.critic_learning_rate},
+            {"params": [p for p in policy.parameters() if p.requires_grad], "lr": config.learning_rate},
+            {"params": [p for p in critic.parameters() if p.requires_grad], "lr": config.critic_learning_rate},
         ]
         self.optimizer = torch.optim.Adam(groups, fused=True)
         self.learning_rate = config.learning_rate  # the policy's
         self.num_processes = dist.get_world_size() if dist.is_initialized() else 1
         # every gradient is a slice of one flat buffer, followed by what else a minibatch sums: one all-reduce
-        sizes, self.num_stats = [p.numel() for p in parameters], 4
-        self.flat = torch.zeros(sum(sizes) + self.num_stats, device=parameters[0].device)
-        self.gradient, self.stats = self.flat[: -self.num_stats], self.flat[-self.num_stats :]
+        sizes = [p.numel() for p in parameters]
+        self.flat = torch.zeros(sum(sizes) + len(self.STATS), device=parameters[0].device)
+        self.gradient, self.stats = self.flat[: -len(self.STATS)], self.flat[-len(self.STATS) :]
         for p, part in zip(parameters, self.gradient.split(sizes)):
             p.grad = part.view_as(p)
 
@@ -253,34 +267,37 @@ class Learner:
 
         size = len(buffer) // config.minibatches
         micro = min(size, MICRO_BATCH) if buffer.reward.device.type == "cpu" else size
-        totals = torch.zeros(self.num_stats, device=buffer.reward.device)
+        totals = torch.zeros_like(self.stats)
         for _ in range(config.epochs):
             order = torch.randperm(len(buffer), generator=generator, device=generator.device)
             for index in order[: size * config.minibatches].split(size):  # a minibatch: one step of the optimiser
                 self.flat.zero_()
                 for part in index.split(micro):
-                    self._accumulate(buffer.minibatch(part), buffer.sigma, share=len(part) / size / self.num_processes)
+                    share = len(part) / size / self.num_processes  # of the minibatch over all processes
+                    loss, stats = self.loss(buffer.minibatch(part), buffer.sigma)
+                    (loss * share).backward()
+                    for i, name in enumerate(self.STATS):
+                        self.stats[i] += share * stats.get(name, 0.0)
                 all_reduce(self.flat)
                 self._step()
                 totals += self.stats
         means = (totals / (config.epochs * config.minibatches)).tolist()
-        stats = dict(zip(("surrogate", "value_loss", "clip_fraction", "kl"), means))
+        stats = dict(zip(self.STATS, means))
         self.learning_rate = adapt_learning_rate(self.learning_rate, stats["kl"], config.target_kl)
         self.optimizer.param_groups[0]["lr"] = self.learning_rate
         return stats
 
-    def _accumulate(self, batch: dict, old_sigma: Tensor, share: float) -> None:
-        """Adds a micro-batch's gradient; `share` is its part of the minibatch over all processes."""
+    def loss(self, batch: dict, old_sigma: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
+        """The mean loss of a micro-batch, and what it is made of (some of `STATS`)."""
         mean = self.policy(batch["observation"], batch["masks"])
         old, new = gaussian(batch["mean"], old_sigma), gaussian(mean, self.policy.sigma())
         loss, stats = ppo_loss(
             new.log_prob(batch["action"]).sum(-1), batch["log_prob"], batch["advantage"],
             self.critic(batch["observation"]), batch["value"], batch["value_target"], new.entropy().sum(-1), self.config,
         )  # fmt: skip
-        (loss * share).backward()
         with torch.no_grad():
-            kl = kl_divergence(old, new).sum(-1).mean()
-            self.stats += share * torch.stack([*stats.values(), kl])
+            stats["kl"] = kl_divergence(old, new).sum(-1).mean()
+        return loss, {name: value.detach() for name, value in stats.items()}
 
     def _step(self) -> None:
         """One step of the optimiser, with clipped gradient."""

@@ -45,7 +45,7 @@ def film(
     `warm_up` seconds. Links behind a fault are red. The film ends where the robot falls.
     """
     config = EnvConfig(forward_speed=(speed, speed), heading=(0.0, 0.0), push_speed=0.0, episode_seconds=3600)
-    env = LocomotionEnv(robot, 1, seed, 1, config=config)
+    env = LocomotionEnv(robot, 1, seed, 1, config=config, extras=policy.extras)
     env.pin_faults([fault])
     observation = env.reset()
     model = env.model

@@ -25,7 +25,6 @@ import torch
 from torch import Tensor, nn
 
 from env import HISTORY, SCAN_SHAPE, Observation
-from robots import Robot
 
 SIGMA_BOUNDS = (math.log(0.05), math.log(2.0))  # ours
 
@@ -91,6 +90,11 @@ class EncoderLayer(nn.Module):
 class ROLT(nn.Module):
     """Gaussian policy: the mean of every joint's action from the transformer, and a learned sigma a kind of joint."""
 
+    # what a policy tells train.py and evaluate.py of itself
+    extras = ()  # of the observation (env.py), that it reads
+    height_noise = 0.0  # m, added to the heights in training: none, "training only under clean observations" (paper)
+    replays_masks = True  # in the update
+
     def __init__(self, num_legs: int, num_joints: int, config: ROLTConfig = ROLTConfig()):
         super().__init__()
         self.config, self.num_legs, self.num_joints = config, num_legs, num_joints
@@ -104,7 +108,8 @@ class ROLT(nn.Module):
             self.action_embedding = nn.Linear(num_legs * num_joints, D)
         self.patch_embedding = nn.Linear(config.patch**2, D)
         self.patch_position = nn.Parameter(0.02 * torch.randn(self.num_patches, D))  # p_e
-        self.dropped_position = nn.Parameter(0.02 * torch.randn(D))  # stands in for every dropped p_e
+        if config.pe_dropout > 0:
+            self.dropped_position = nn.Parameter(0.02 * torch.randn(D))  # stands in for every dropped p_e
         self.encoder = nn.ModuleList(EncoderLayer(config) for _ in range(config.layers))
         self.norm = nn.LayerNorm(D)
         self.decoder = nn.Linear(D, num_joints)
@@ -174,17 +179,3 @@ class ROLT(nn.Module):
             x, weights = layer(x, self._queries(i), masks.get(f"attention_{i}"), masks.get(f"feedforward_{i}"))
             attention.append(weights)
         return self.decoder(self.norm(x)).flatten(1), attention  # (B, L, J) -> (B, L*J)
-
-
-# The policies of `train.py --policy`: ROLT and the paper's ablations of it.
-POLICIES = {
-    "rolt": ROLTConfig(),
-    "module-pe": ROLTConfig(leg_pe=True),
-    "no-pe-drop": ROLTConfig(pe_dropout=0.0),
-    "no-feature-drop": ROLTConfig(feature_dropout=0.0),
-}
-
-
-def make_policy(name: str, robot: Robot) -> nn.Module:
-    """A policy for the robot, with fresh weights from torch's global generator."""
-    return ROLT(len(robot.legs), len(robot.links), POLICIES[name])

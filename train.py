@@ -3,6 +3,7 @@
     python train.py --robot a1                            # ROLT on the stiffness task, a few hours on two cores
     python train.py --robot a1 --steps 20000              # does it run? a minute
     python train.py --robot a1 --resume                   # goes on where it was stopped (Ctrl-C is safe)
+    python train.py --robot a1 --policy all               # every method of the paper in turn; skips what is finished
     python train.py --robot a1 --paper --device cuda      # the paper's size: 4096 robots, 400 million steps
 
 Everything goes to runs/ROBOT-TASK-POLICY-seedN (or --out): policy.pt (for evaluate.py), checkpoint.pt (for --resume),
@@ -25,8 +26,10 @@ from pathlib import Path
 import torch
 import torch.distributed as dist
 import torch.multiprocessing as mp
+from torch import nn
 
 import checkpoint
+from baselines import METHODS, Stage, make_policy, training_stages
 from cli import Parser, count, fail, num_cores, positive, seed, writable_folder
 from env import CONTROL_DT, LocomotionEnv
 from faults import TASKS
@@ -34,17 +37,17 @@ from plots import learning_curve
 from ppo import Critic, Learner, PPOConfig, RolloutBuffer, all_reduce, collect, to_tensors
 from rewards import REWARDS
 from robots import ROBOTS
-from rolt import POLICIES, make_policy
 
-# What a run may not change when it is resumed.
+# What a run may not change when it is resumed; of rma and roam, whose stages are shares of them, the steps neither.
 IDENTITY = ("robot", "task", "policy", "envs", "epochs", "minibatches", "seed", "processes")
+STAGED = ("rma", "roam")
 
 
 def parse_arguments(argv: list[str] | None = None):
     parser = Parser(__doc__)
     parser.add_argument("--robot", choices=ROBOTS, default="a1")
     parser.add_argument("--task", choices=TASKS, default="stiffness", help="which faults are trained (faults.py)")
-    parser.add_argument("--policy", choices=POLICIES, default="rolt")
+    parser.add_argument("--policy", choices=(*METHODS, "all"), default="rolt")
     parser.add_argument("--envs", type=count, default=256, help="robots simulated at once")
     parser.add_argument("--steps", type=count, default=6_000_000, help="env steps in total, over all robots")
     parser.add_argument("--epochs", type=count, default=PPOConfig.epochs, help="of PPO, over each rollout")
@@ -71,6 +74,10 @@ def parse_arguments(argv: list[str] | None = None):
         fail(f"{args.envs} robots do not divide among {args.processes} processes; change --envs or --threads")
     if args.envs // args.processes * PPOConfig.steps < args.minibatches:
         fail(f"{args.envs} robots are too few for {args.minibatches} minibatches on {args.processes} processes")
+    if args.policy == "all":
+        if args.out:
+            fail("every policy has a folder of its own: leave --out away with --policy all")
+        return args
     args.out = args.out or Path("runs") / f"{args.robot}-{args.task}-{args.policy}-seed{args.seed}"
     saved = args.out / "checkpoint.pt"
     if args.resume and not saved.exists():
@@ -143,6 +150,25 @@ def summarise(infos: list[dict], buffer: RolloutBuffer, env: LocomotionEnv) -> t
     return means, sums
 
 
+class Part:
+    """One stage of the training (most methods have one): its robots, buffer, critic and learner."""
+
+    def __init__(self, number: int, stage: Stage, args, rank: int, policy: nn.Module, device: torch.device):
+        threads = args.threads if args.device == "cuda" else 1
+        share, seeds = args.envs // args.processes, (args.seed, rank, number)
+        self.number, self.actor = number, stage.actor
+        self.env = LocomotionEnv(args.robot, share, seeds, threads, stage.faults, extras=stage.extras)
+        self.observation = self.env.reset(random_ages=True)
+        self.critic = (Critic(self.observation) if stage.critic is None else stage.critic).to(device)
+        policy.requires_grad_(False)
+        for module in stage.trained:
+            module.requires_grad_(True)
+        masks = stage.actor.sample_masks(share, torch.Generator(device)) if stage.actor.replays_masks else {}
+        self.buffer = RolloutBuffer(PPOConfig.steps, self.observation, self.env.num_actions, masks, device)
+        config = PPOConfig(epochs=args.epochs, minibatches=args.minibatches)
+        self.learner = stage.learner(stage.actor, self.critic, config)
+
+
 def train(rank: int, args, sync: str | None) -> None:
     """The training loop of one process."""
     device = torch.device("cpu")
@@ -153,34 +179,30 @@ def train(rank: int, args, sync: str | None) -> None:
         backend = "nccl" if args.device == "cuda" else "gloo"
         dist.init_process_group(backend, init_method=sync, rank=rank, world_size=args.processes)
     torch.set_num_threads(1)
-    config = PPOConfig(epochs=args.epochs, minibatches=args.minibatches)
-    threads = args.threads if args.device == "cuda" else 1
-    faults = TASKS[args.task].training
-    env = LocomotionEnv(args.robot, args.envs // args.processes, (args.seed, rank), threads, faults)
-    observation = env.reset(random_ages=True)
-
+    task, robot = TASKS[args.task], ROBOTS[args.robot]
     torch.manual_seed(args.seed)  # the same weights in every process
-    policy = make_policy(args.policy, env.robot).to(device)
-    critic = Critic(observation).to(device)
+    policy = make_policy(args.policy, robot, task).to(device)
+    stages = training_stages(policy, task)
+    ends = [args.steps * sum(stage.share for stage in stages[: i + 1]) for i in range(len(stages) - 1)] + [args.steps]
     generator = torch.Generator(device).manual_seed(args.seed * 1_000_003 + rank)  # actions, masks, minibatches
-    masks = policy.sample_masks(env.num_envs, torch.Generator(device))  # only their shapes count here
-    buffer = RolloutBuffer(config.steps, observation, env.num_actions, masks, device)
-    learner = Learner(policy, critic, config)
+    part = Part(0, stages[0], args, rank, policy, device)
     iteration, steps = 0, 0
 
     if args.resume:
         saved = checkpoint.load(args.out / "checkpoint.pt")
         iteration, steps = saved["iteration"], saved["steps"]
+        if saved["stage"]:
+            part = Part(saved["stage"], stages[saved["stage"]], args, rank, policy, device)
         policy.load_state_dict(saved["weights"])
-        critic.load_state_dict(saved["critic"])
-        learner.load_state_dict(saved["learner"])
-        env.load_state_dict(from_plain(saved["processes"][rank]["env"]))
+        part.critic.load_state_dict(saved["critic"])
+        part.learner.load_state_dict(saved["learner"])
+        part.env.load_state_dict(from_plain(saved["processes"][rank]["env"]))
         generator.set_state(saved["processes"][rank]["generator"])
-        observation = env.observe()
+        part.observation = part.env.observe()
 
     def save() -> None:
         """Process 0 writes the files; the others tell it their part."""
-        mine = {"env": to_plain(env.state_dict()), "generator": generator.get_state()}
+        mine = {"env": to_plain(part.env.state_dict()), "generator": generator.get_state()}
         everyone = [mine] * args.processes
         if args.processes > 1:
             dist.gather_object(mine, everyone if rank == 0 else None)
@@ -188,8 +210,8 @@ def train(rank: int, args, sync: str | None) -> None:
             content = {key: getattr(args, key) for key in ("robot", "task", "policy", "seed")} | {"steps": steps}
             content["weights"] = {name: tensor.cpu() for name, tensor in policy.state_dict().items()}
             checkpoint.save(content, args.out / "policy.pt")
-            content |= {"critic": critic.state_dict(), "learner": learner.state_dict(), "processes": everyone}
-            content |= {"iteration": iteration, "identity": {key: getattr(args, key) for key in IDENTITY}}
+            content |= {"critic": part.critic.state_dict(), "learner": part.learner.state_dict(), "processes": everyone}
+            content |= {"iteration": iteration, "stage": part.number, "identity": identity(args)}
             checkpoint.save(content, args.out / "checkpoint.pt")
             learning_curve(args.out / "progress.csv", args.out / "progress.png")
 
@@ -198,19 +220,22 @@ def train(rank: int, args, sync: str | None) -> None:
     progress = Progress(args, iteration, steps) if rank == 0 else None
     saved_at = time.time()
     while steps < args.steps:
+        if steps >= ends[part.number]:
+            number = part.number + 1
+            part = Part(number, stages[number], args, rank, policy, device)
         started = time.perf_counter()
-        observation, infos = collect(env, policy, critic, buffer, observation, generator)
+        part.observation, infos = collect(part.env, part.actor, part.critic, part.buffer, part.observation, generator)
         collected = time.perf_counter()
-        losses = learner.update(buffer, generator)
+        losses = part.learner.update(part.buffer, generator)
         updated = time.perf_counter()
-        iteration, steps = iteration + 1, steps + len(buffer) * args.processes
+        iteration, steps = iteration + 1, steps + len(part.buffer) * args.processes
 
-        means, sums = summarise(infos, buffer, env)
+        means, sums = summarise(infos, part.buffer, part.env)
         overdue = rank == 0 and time.time() - saved_at > 60 * args.save_minutes
         shared = sum_over_processes(means | sums | {"stop": bool(stop), "save": overdue}, device)  # all must agree
         if rank == 0:
-            row = {"iteration": iteration, "steps": steps} | {name: shared[name] / args.processes for name in means}
-            row |= {"sigma": policy.sigma().mean().item(), "learning_rate": learner.learning_rate} | losses
+            row = {"iteration": iteration, "steps": steps, "stage": part.number} | {name: shared[name] / args.processes for name in means}
+            row |= {"sigma": part.actor.sigma().mean().item(), "learning_rate": part.learner.learning_rate} | losses
             row |= {"collect_seconds": collected - started, "update_seconds": updated - collected}
             progress.log(row | {"divergences": int(shared["divergences"])}, shared)
         if shared["save"] or shared["stop"] or steps >= args.steps:
@@ -253,17 +278,38 @@ def guarded(rank: int, args, sync: str | None) -> None:
         os._exit(1)  # at once: the other processes wait for this one and are ended by the parent
 
 
+def identity(args) -> dict:
+    return {key: getattr(args, key) for key in (*IDENTITY, *(("steps",) if args.policy in STAGED else ()))}
+
+
+def train_all(words: list[str], args) -> None:
+    """Every method of the task, one after the other: what is finished is skipped, what was stopped goes on."""
+    words = [word for word in words if word != "--resume"]
+    for policy in METHODS:
+        out = Path("runs") / f"{args.robot}-{args.task}-{policy}-seed{args.seed}"
+
+        def steps_done() -> int:
+            return checkpoint.load(out / "policy.pt")["steps"] if (out / "checkpoint.pt").exists() else 0
+
+        done = steps_done()
+        print(f"{policy}: {done:,} of {args.steps:,} steps", flush=True)
+        if done < args.steps:
+            main([*words, "--policy", policy, *(["--resume"] if done else [])])
+            if steps_done() < args.steps:
+                return  # interrupted
+
+
 def main(argv: list[str] | None = None) -> None:
     args = parse_arguments(argv)
-    if args.resume:
-        try:
-            identity = checkpoint.load(args.out / "checkpoint.pt").get("identity", {})
-        except checkpoint.CheckpointError as error:
-            fail(error)
-        pairs = {key: (identity.get(key), getattr(args, key)) for key in IDENTITY}
-        differing = [f"{key} was {was}, is {now}" for key, (was, now) in pairs.items() if was != now]
-        if differing:
-            fail(f"the run in {args.out} was another one: {'; '.join(differing)}")
+    try:
+        if args.policy == "all":
+            return train_all(sys.argv[1:] if argv is None else argv, args)
+        was = checkpoint.load(args.out / "checkpoint.pt").get("identity", {}) if args.resume else identity(args)
+    except checkpoint.CheckpointError as error:
+        fail(error)
+    differing = [f"{key} was {was.get(key)}, is {now}" for key, now in identity(args).items() if was.get(key) != now]
+    if differing:
+        fail(f"the run in {args.out} was another one: {'; '.join(differing)}")
     if "RANK" in os.environ:  # started by torchrun, which has made the processes
         guarded(int(os.environ["RANK"]), args, "env://")
     elif args.processes == 1:

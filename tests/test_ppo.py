@@ -5,13 +5,13 @@ import math
 import pytest
 import torch
 
+from baselines import make_policy
 from env import EnvConfig, LocomotionEnv
 from faults import TASKS
 from ppo import (
     Critic, Learner, PPOConfig, RolloutBuffer, adapt_learning_rate, collect, compute_gae, pack_bits, ppo_loss, to_tensors,
     unpack_bits,
 )  # fmt: skip
-from rolt import make_policy
 
 
 def column(*values):

@@ -11,8 +11,8 @@ import torch
 import checkpoint
 import evaluate
 import train
+from baselines import make_policy
 from robots import A1
-from rolt import make_policy
 
 ROOT = Path(__file__).resolve().parent.parent
 SMALL = ["--envs", "8", "--minibatches", "2", "--epochs", "1"]
