@@ -8,7 +8,7 @@
     Module PE, No PE Drop, No Feature Drop: switches of ROLT (rolt.py)
 
 A policy is a module with forward(observation, masks) -> (B, A) mean action, sigma() -> (A,), sample_masks(n, generator)
--> {name: (n, ...) bool}, and three words on itself: `extras`, `height_noise`, `replays_masks` (see ROLT). How it is
+-> {name: (n, ...) bool}, and a few words on itself (`extras` and what follows in ROLT). How it is
 trained is a list of `Stage`s: most have one.
 
 Legend: B samples, L legs, J joints a leg, A = L*J actions, H = 10 steps of history, K training situations.
@@ -25,6 +25,7 @@ from torch.utils.benchmark import Timer
 
 from env import HISTORY, SCAN_SHAPE, LocomotionEnv, Observation
 from faults import TASKS, Fault, Task
+from normalizer import Normalizer
 from ppo import Learner, PPOConfig, to_tensors
 from robots import ROBOTS, Robot
 from rolt import ROLT, SIGMA_BOUNDS, Masks, ROLTConfig, drop
@@ -69,10 +70,12 @@ class MLP(nn.Module):
     extras = ()
     height_noise = HEIGHT_NOISE
     replays_masks = True  # there are none
+    micro_batch = 1024  # more than ROLT's: wide layers and few activations
 
     def __init__(self, num_legs: int, num_joints: int):
         super().__init__()
         A = num_legs * num_joints
+        self.normalizer = Normalizer(num_joints)
         sizes = (HISTORY * (3 * A + 12) + SCAN_SHAPE[0] * SCAN_SHAPE[1], *HIDDEN)
         self.hidden = nn.ModuleList(nn.Linear(a, b) for a, b in zip(sizes, sizes[1:]))
         self.decoder = action_layer(sizes[-1], A)
@@ -85,7 +88,7 @@ class MLP(nn.Module):
         return {}
 
     def forward(self, observation: Observation, masks: Masks | None = None) -> Tensor:
-        x = everything(observation)
+        x = everything(self.normalizer(observation))
         for i, layer in enumerate(self.hidden):
             x = drop(nn.functional.elu(layer(x)), (masks or {}).get(f"hidden_{i}"), ROLL_DROP_RATE)
         return self.decoder(x)
@@ -137,11 +140,13 @@ class RMA(nn.Module):
     extras = ("past",)
     height_noise = HEIGHT_NOISE
     replays_masks = True  # there are none
+    micro_batch = 1024  # more than ROLT's: wide layers and few activations
 
     def __init__(self, num_legs: int, num_joints: int):
         super().__init__()
         A = num_legs * num_joints
         frame = 3 * A + 12
+        self.normalizer = Normalizer(num_joints, num_privileged=2 * A + 1)
         self.heights = nn.Sequential(  # the paper's "CNN to encode height values"; sizes ours
             nn.Unflatten(1, (1, SCAN_SHAPE[0])), nn.Conv2d(1, 8, 3, stride=2, padding=1), nn.ELU(),
             nn.Conv2d(8, 16, 3, stride=2, padding=1), nn.ELU(), nn.Flatten(),
@@ -156,6 +161,7 @@ class RMA(nn.Module):
     sigma, sample_masks = MLP.sigma, MLP.sample_masks
 
     def forward(self, observation: Observation, masks: Masks | None = None) -> Tensor:
+        observation = self.normalizer(observation)
         z = self.adaptation(observation.past) if observation.past.numel() else self.encoder(observation.privileged)
         senses = proprioception(observation.legs).flatten(1), self.heights(observation.heights)
         return self.base(torch.cat([*senses, z], dim=1))
@@ -195,11 +201,13 @@ class NoCritic(nn.Module):
 class AdaptationLearner(Learner):
     """Stage 2: mean squared error between the guessed z and the encoder's."""
 
+    measures = False  # the base is frozen, and so is what it sees
+
     def __init__(self, policy: RMA, critic: NoCritic, config: PPOConfig):
         super().__init__(policy, critic, replace(config, learning_rate=1e-3))  # ours: supervised learning bears more
 
     def loss(self, batch: dict, old_sigma: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
-        observation = batch["observation"]
+        observation = self.policy.normalizer(batch["observation"])
         with torch.no_grad():
             truth = self.policy.encoder(observation.privileged)
         error = (self.policy.adaptation(observation.past) - truth).square().mean()
@@ -219,12 +227,13 @@ class ROAM(nn.Module):
     extras = ()
     height_noise = 0.0
     replays_masks = True  # there are none
+    micro_batch = 1024  # more than ROLT's: wide layers and few activations
 
     def __init__(self, num_legs: int, num_joints: int, num_situations: int = 2):
         super().__init__()
         inputs = HISTORY * (3 * num_legs * num_joints + 12) + SCAN_SHAPE[0] * SCAN_SHAPE[1]
         self.behaviours = nn.ModuleList(MLP(num_legs, num_joints) for _ in range(num_situations))
-        self.critics = nn.ModuleList(BehaviourValue(inputs) for _ in range(num_situations))
+        self.critics = nn.ModuleList(BehaviourValue(inputs, behaviour.normalizer) for behaviour in self.behaviours)
         self.generator = torch.Generator().manual_seed(0)  # of the choice at test
         self.picked = torch.zeros(num_situations)  # how often each behaviour was chosen at test
 
@@ -259,12 +268,13 @@ class ROAM(nn.Module):
 class BehaviourValue(nn.Module):
     """V_i(s), on what the MLP sees (the other methods' critic sees its previous action twice)."""
 
-    def __init__(self, inputs: int):
+    def __init__(self, inputs: int, normalizer: Normalizer):
         super().__init__()
+        self.normalizer = normalizer  # the behaviour's
         self.network = network(inputs, *HIDDEN, 1)
 
     def forward(self, observation: Observation) -> Tensor:
-        return self.network(everything(observation)).squeeze(1)
+        return self.network(everything(self.normalizer(observation))).squeeze(1)
 
 
 class OwnValue(nn.Module):
@@ -291,6 +301,8 @@ def roam_loss(values: Tensor, situation: Tensor, target: Tensor, weight: float =
 
 class ROAMLearner(Learner):
     """The last stage: nothing but the values learns."""
+
+    measures = False
 
     def __init__(self, policy: ROAM, critic: OwnValue, config: PPOConfig):
         super().__init__(policy, critic, replace(config, learning_rate=config.critic_learning_rate))

@@ -19,8 +19,9 @@ from baselines import make_policy
 from cli import Parser, count, num_cores
 from env import LocomotionEnv
 from faults import TASKS
-from ppo import MICRO_BATCH, to_tensors
+from ppo import to_tensors
 from robots import ROBOTS
+from rolt import ROLT
 
 
 def seconds(function) -> float:
@@ -92,9 +93,9 @@ def main(argv: list[str] | None = None) -> None:
     print(f"simulation  env.step takes {total / bare:.2f} times its bare Batch.step")
     print(f"            {steps / total:,.0f} env steps/s, bare {steps / bare:,.0f} ({args.envs} robots, {args.threads} threads)")
     torch.set_num_threads(1)
-    network, plain, work = time_learner(args.robot, MICRO_BATCH)
+    network, plain, work = time_learner(args.robot, ROLT.micro_batch)
     print(f"learner     forward and backward run at {plain / network:.0%} of the rate of their matrix products")
-    print(f"            {MICRO_BATCH / network:,.0f} samples/s, {work / network:.0f} GFLOP/s of {work / plain:.0f} (one thread)")
+    print(f"            {ROLT.micro_batch / network:,.0f} samples/s, {work / network:.0f} GFLOP/s of {work / plain:.0f} (one thread)")
 
 
 if __name__ == "__main__":

@@ -131,11 +131,24 @@ class Task:
 
 
 TASKS = {
-    # Section IV-A (i): healthy and FR limping in training, "the other legs limp in the test". Halves: ours.
+    # Section IV-A (i): healthy and FR limping in training, "the other legs limp in the test". Halves: ours. The Go1 of the
+    # real-world test was trained on the same.
     "stiffness": Task(
-        robots=("a1",),
+        robots=("a1", "go1"),
         training=((0.5, healthy()), (0.5, lock("FR_calf"))),
         unseen=(lock("FL_calf"), lock("RR_calf"), lock("RL_calf")),
+    ),
+    # Section IV-A (ii): FRT, MRT, MLC in training, one of them at a time (T thigh, C calf), and the paper's nine in the
+    # test. Quarters: ours.
+    "damage": Task(
+        robots=("hexapod",),
+        training=(
+            (0.25, healthy()), (0.25, disable("FR_thigh")), (0.25, disable("MR_thigh")), (0.25, disable("ML_calf")),
+        ),
+        unseen=tuple(
+            disable(joint)
+            for joint in ("FL_calf", "FL_thigh", "FR_calf", "MR_calf", "ML_thigh", "HL_thigh", "HL_calf", "HR_thigh", "HR_calf")
+        ),
     ),
 }
 

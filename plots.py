@@ -58,6 +58,28 @@ def bar_charts(
     save_figure(figure, picture)
 
 
+def ratio_bands(rows: list[dict], picture: Path, title: str) -> None:
+    """PPO's ratio against the dropout rate, a band for each way to treat the masks, and the share that PPO clips."""
+    labels = {"stored": "stored masks (consistent dropout)", "fresh": "fresh masks (ordinary dropout)", "none": "no masks (Roll-Drop)"}
+    figure, (left, right) = plt.subplots(1, 2, figsize=(10.4, 3.8), layout="constrained")
+    for masks, label in labels.items():
+        mine = [row for row in rows if row["masks"] == masks]
+        rate, low, median, high, clipped = (np.array([row[k] for row in mine]) for k in ("rate", "low", "median", "high", "clipped"))
+        (line,) = left.plot(rate, median, marker="o", markersize=3, label=label)
+        left.fill_between(rate, low, high, alpha=0.2, color=line.get_color())
+        right.plot(rate, 100 * clipped, marker="o", markersize=3, label=label)
+    left.set_yscale("log")
+    left.set_ylabel("pi_new / pi_old")
+    right.set_ylabel("samples outside the clip range [%]")
+    for axis in (left, right):
+        axis.set_xscale("log")
+        axis.set_xlabel("feature dropout rate")
+        axis.grid(alpha=0.3)
+    right.legend(fontsize=8, frameon=False)
+    figure.suptitle(title, fontsize=10)
+    save_figure(figure, picture)
+
+
 def save_figure(figure, picture: Path) -> None:
     """Writes the picture whole or not at all."""
     temporary = picture.with_name("." + picture.name)

@@ -20,8 +20,7 @@ from torch import Tensor, nn
 from torch.distributions import Normal, kl_divergence
 
 from env import HEIGHT_SCALE, LocomotionEnv, Observation
-
-MICRO_BATCH = 128  # samples a forward pass on a CPU, ours: the activations stay in the cache (fastest of 64 to 1024)
+from normalizer import Normalizer
 
 
 @dataclass(frozen=True)
@@ -43,15 +42,17 @@ class PPOConfig:
 class Critic(nn.Module):
     """V(s): an MLP on everything the policy sees, [512, 256, 128] ELU (legged_gym), without dropout."""
 
-    def __init__(self, observation: Observation):
+    def __init__(self, observation: Observation, normalizer: Normalizer):
         super().__init__()
+        self.normalizer = normalizer  # the policy's
         sizes = [sum(field[0].size for field in seen(observation)), 512, 256, 128]
         layers = [module for a, b in zip(sizes, sizes[1:]) for module in (nn.Linear(a, b), nn.ELU())]
         self.network = nn.Sequential(*layers, nn.Linear(sizes[-1], 1))
 
     def forward(self, observation: Observation) -> Tensor:
         """(B,) value of each observation."""
-        return self.network(torch.cat([field.flatten(1) for field in seen(observation)], dim=1)).squeeze(1)
+        fields = seen(self.normalizer(observation))
+        return self.network(torch.cat([field.flatten(1) for field in fields], dim=1)).squeeze(1)
 
 
 def seen(observation: Observation) -> tuple:
@@ -224,6 +225,7 @@ class Learner:
     Trains the parameters that require a gradient. The baselines' later stages (baselines.py) override `loss`.
     """
 
+    measures = True  # the update ends by showing the rollout to the policy's normalizer
     STATS = ("surrogate", "value_loss", "clip_fraction", "kl", "other_loss")  # what `update` reports
 
     def __init__(self, policy, critic: nn.Module, config: PPOConfig):
@@ -266,7 +268,7 @@ class Learner:
         buffer.advantage = self._normalise(buffer.advantage)
 
         size = len(buffer) // config.minibatches
-        micro = min(size, MICRO_BATCH) if buffer.reward.device.type == "cpu" else size
+        micro = min(size, self.policy.micro_batch) if buffer.reward.device.type == "cpu" else size
         totals = torch.zeros_like(self.stats)
         for _ in range(config.epochs):
             order = torch.randperm(len(buffer), generator=generator, device=generator.device)
@@ -285,6 +287,8 @@ class Learner:
         stats = dict(zip(self.STATS, means))
         self.learning_rate = adapt_learning_rate(self.learning_rate, stats["kl"], config.target_kl)
         self.optimizer.param_groups[0]["lr"] = self.learning_rate
+        if self.measures:
+            self.policy.normalizer.update(buffer.observation, all_reduce)
         return stats
 
     def loss(self, batch: dict, old_sigma: Tensor) -> tuple[Tensor, dict[str, Tensor]]:

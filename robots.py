@@ -211,7 +211,79 @@ A1 = Robot(
     friction_loss=0.2,
 )  # fmt: skip
 
-ROBOTS = {"a1": A1}
+# Unitree Go1, 12.74 kg. Source: mujoco_menagerie unitree_go1/go1.xml (masses, inertias, limits, friction), Unitree's
+# go1.urdf (trunk box), legged_gym's a1_config.py (pose, gains, action scale: the same machine in other clothes).
+GO1 = Robot(
+    name="go1",
+    trunk_mass=5.204,
+    trunk_com=(0.0223, 0.002, -0.0005),
+    trunk_inertia=(0.0168128, 0.0630095, 0.0716547, -2.3e-4, -2.95e-4, -4.2e-5),
+    trunk_box=(0.3762, 0.0935, 0.114),
+    legs=("FR", "FL", "RR", "RL"),
+    mounts=((0.1881, -0.04675, 0), (0.1881, 0.04675, 0), (-0.1881, -0.04675, 0), (-0.1881, 0.04675, 0)),
+    links=(
+        Link("hip", 0.68, (-0.0049166, 0.00762615, -8.865e-5),
+             (0.00039938, 0.00073342, 0.00046842, 1.5e-5, 1e-6, -2e-6),
+             offset=(0, 0, 0), axis=(1, 0, 0), axis_left=(1, 0, 0), limits=(-0.863, 0.863), effort=23.7,
+             capsule=None, rear_mirrors_x=True),
+        Link("thigh", 1.009, (-0.00304722, 0.019315, -0.0305004),
+             (0.0045988, 0.0046892, 0.00081745, -6.1e-5, -2.28e-4, -6.11e-4),
+             offset=(0, -0.08, 0), axis=(0, 1, 0), axis_left=(0, 1, 0), limits=(-0.686, 4.501), effort=23.7,
+             capsule=(0.015, (0, 0, -0.01), (0, 0, -0.198))),
+        Link("calf", 0.195862, (0.00429862, 0.000976676, -0.146197),
+             (0.00148449, 0.00149764, 3.607e-5, 0, -1.8e-5, -4e-6),
+             offset=(0, 0, -0.213), axis=(0, 1, 0), axis_left=(0, 1, 0), limits=(-2.818, -0.888), effort=35.55,
+             capsule=(0.01, (0, 0, 0), (0, 0, -0.19))),
+    ),
+    foot_position=(0, 0, -0.213),
+    foot_radius=0.023,
+    default_pose=((-0.1, 0.8, -1.5), (0.1, 0.8, -1.5), (-0.1, 1.0, -1.5), (0.1, 1.0, -1.5)),
+    start_height=0.45,  # ours: legs may start stretched, and must not start in the ground
+    stiffness=20.0,
+    damping=0.5,
+    action_scale=0.25,
+    armature=0.01,
+    friction_loss=0.2,
+)  # fmt: skip
+
+# ElSpider Air, 30.5 kg: the hexapod of the authors' laboratory (the paper names none). Source: extended_legged_gym
+# el_mini.urdf (masses, inertias, geometry, limits) and elspider_air.h (pose, gains). The hips turn about the vertical, the thighs
+# point up and the calves down. The foot (0.019 kg) is part of the calf. Links are capsules as thick as their boxes.
+# Ours, where the sources are silent: armature and dry friction (the A1's), the start height.
+HEXAPOD = Robot(
+    name="hexapod",
+    trunk_mass=15.8991,
+    trunk_com=(0, 0, 0.02429),
+    trunk_inertia=(0.0926086, 0.47054913, 0.53896766, 0, 0, 0),
+    trunk_box=(0.6, 0.28, 0.14),
+    legs=("FR", "FL", "MR", "ML", "HR", "HL"),
+    mounts=((0.3, -0.08, 0.011), (0.3, 0.08, 0.011), (0, -0.14, 0.011), (0, 0.14, 0.011), (-0.3, -0.08, 0.011), (-0.3, 0.08, 0.011)),
+    links=(
+        Link("hip", 1.20924, (-0.01147, -0.12306, -0.03644),
+             (0.00506, 0.00134, 0.00448, -3.8e-4, -1.2e-4, -1.02e-3),
+             offset=(0, 0, 0), axis=(0, 0, 1), axis_left=(0, 0, -1), limits=(-0.785, 0.785), effort=33.5,
+             capsule=(0.04, (0.02, -0.06, -0.03), (0.0355, -0.14, -0.04)), rear_mirrors_x=True),
+        Link("thigh", 0.925235, (-0.01977, 0.00006, 0.11425),
+             (0.00238, 0.00209, 0.00066, 0, 1.2e-4, 0),
+             offset=(0.0355, -0.14999, -0.04506), axis=(1, 0, 0), axis_left=(-1, 0, 0), limits=(-0.5233, 3.14), effort=33.5,
+             capsule=(0.04, (0, 0, 0), (0, 0, 0.13)), rear_mirrors_x=True),
+        Link("calf", 0.3004999, (0.009795, 0, -0.080474),
+             (0.003056, 0.0030374, 9.137e-5, 0, 1.952e-4, 0),
+             offset=(0, 0, 0.13), axis=(-1, 0, 0), axis_left=(1, 0, 0), limits=(-0.6978, 3.925), effort=33.5,
+             capsule=(0.015, (0, 0, 0), (0.0166, 0, -0.213)), rear_mirrors_x=True),
+    ),
+    foot_position=(0.018, 0, -0.232),
+    foot_radius=0.02,
+    default_pose=((0, 0.6, 0.6),) * 6,
+    start_height=0.22,
+    stiffness=80.0,
+    damping=2.0,
+    action_scale=0.25,
+    armature=0.01,
+    friction_loss=0.2,
+)  # fmt: skip
+
+ROBOTS = {"a1": A1, "go1": GO1, "hexapod": HEXAPOD}
 
 
 if __name__ == "__main__":

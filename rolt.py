@@ -25,6 +25,7 @@ import torch
 from torch import Tensor, nn
 
 from env import HISTORY, SCAN_SHAPE, Observation
+from normalizer import Normalizer
 
 SIGMA_BOUNDS = (math.log(0.05), math.log(2.0))  # ours
 
@@ -94,10 +95,12 @@ class ROLT(nn.Module):
     extras = ()  # of the observation (env.py), that it reads
     height_noise = 0.0  # m, added to the heights in training: none, "training only under clean observations" (paper)
     replays_masks = True  # in the update
+    micro_batch = 128  # samples a pass of the update on a CPU, so that activations stay in the cache (fastest of 64 to 1024)
 
     def __init__(self, num_legs: int, num_joints: int, config: ROLTConfig = ROLTConfig()):
         super().__init__()
         self.config, self.num_legs, self.num_joints = config, num_legs, num_joints
+        self.normalizer = Normalizer(num_joints)
         D, rows, columns = config.width, SCAN_SHAPE[0] // config.patch, SCAN_SHAPE[1] // config.patch
         self.num_patches = rows * columns
         frame = 3 * num_joints + 12  # numbers that one leg sees in one step
@@ -152,7 +155,7 @@ class ROLT(nn.Module):
 
     def tokens(self, observation: Observation, masks: Masks | None) -> Tensor:
         """E_0 = [e^prop, e^h], (B, T, D)."""
-        masks = masks or {}
+        observation, masks = self.normalizer(observation), masks or {}
         legs = self.leg_embedding(observation.legs.flatten(2))  # (B, L, H*frame) -> (B, L, D), eq. 1
         if self.config.leg_pe:
             proprioception = legs + self.leg_position
@@ -161,7 +164,7 @@ class ROLT(nn.Module):
             proprioception = torch.cat([legs, action[:, None]], dim=1)  # (B, L+1, D), eq. 3
 
         B, (rows, columns), s = len(legs), SCAN_SHAPE, self.config.patch
-        patches = observation.heights.view(B, rows // s, s, columns // s, s).transpose(2, 3)  # (B, 4, 3, s, s)
+        patches = observation.heights.reshape(B, rows // s, s, columns // s, s).transpose(2, 3)  # (B, 4, 3, s, s)
         patches = self.patch_embedding(patches.reshape(B, self.num_patches, s * s))  # (B, P, D)
         position = self.patch_position
         if "patch_position" in masks:

@@ -46,7 +46,7 @@ STAGED = ("rma", "roam")
 def parse_arguments(argv: list[str] | None = None):
     parser = Parser(__doc__)
     parser.add_argument("--robot", choices=ROBOTS, default="a1")
-    parser.add_argument("--task", choices=TASKS, default="stiffness", help="which faults are trained (faults.py)")
+    parser.add_argument("--task", choices=TASKS, help="which faults are trained, see faults.py (default: the robot's first)")
     parser.add_argument("--policy", choices=(*METHODS, "all"), default="rolt")
     parser.add_argument("--envs", type=count, default=256, help="robots simulated at once")
     parser.add_argument("--steps", type=count, default=6_000_000, help="env steps in total, over all robots")
@@ -63,6 +63,7 @@ def parse_arguments(argv: list[str] | None = None):
 
     if args.paper:
         args.envs, args.steps, args.epochs, args.minibatches = 4096, 400_000_000, 5, 4
+    args.task = args.task or next(name for name, task in TASKS.items() if args.robot in task.robots)
     if args.robot not in TASKS[args.task].robots:
         fail(f"the task {args.task} is for {', '.join(TASKS[args.task].robots)}, not for {args.robot}")
     if args.device == "cuda" and not torch.cuda.is_available():
@@ -159,7 +160,7 @@ class Part:
         self.number, self.actor = number, stage.actor
         self.env = LocomotionEnv(args.robot, share, seeds, threads, stage.faults, extras=stage.extras)
         self.observation = self.env.reset(random_ages=True)
-        self.critic = (Critic(self.observation) if stage.critic is None else stage.critic).to(device)
+        self.critic = (Critic(self.observation, stage.actor.normalizer) if stage.critic is None else stage.critic).to(device)
         policy.requires_grad_(False)
         for module in stage.trained:
             module.requires_grad_(True)
@@ -223,6 +224,9 @@ def train(rank: int, args, sync: str | None) -> None:
         if steps >= ends[part.number]:
             number = part.number + 1
             part = Part(number, stages[number], args, rank, policy, device)
+        if part.learner.measures and not part.actor.normalizer.count:  # the first rollout is for the normalizer alone
+            part.observation, _ = collect(part.env, part.actor, part.critic, part.buffer, part.observation, generator)
+            part.actor.normalizer.update(part.buffer.observation, all_reduce)
         started = time.perf_counter()
         part.observation, infos = collect(part.env, part.actor, part.critic, part.buffer, part.observation, generator)
         collected = time.perf_counter()

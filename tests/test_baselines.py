@@ -36,7 +36,7 @@ def run_stage(policy, stage, seed=0, config=PPOConfig(epochs=2, minibatches=2), 
     """One rollout and a learner for it."""
     env = LocomotionEnv(A1, n, seed, 1, stage.faults, extras=stage.extras)
     observation, generator = env.reset(random_ages=True), torch.Generator().manual_seed(seed)
-    critic = Critic(observation) if stage.critic is None else stage.critic
+    critic = Critic(observation, stage.actor.normalizer) if stage.critic is None else stage.critic
     policy.requires_grad_(False)
     for module in stage.trained:
         module.requires_grad_(True)
@@ -134,8 +134,8 @@ def test_rma_is_told_what_is_wrong():
 def test_rmas_second_stage_guesses_better_and_leaves_the_base_alone():
     policy = fresh("rma")
     _, stage = training_stages(policy, TASK)
-    buffer, learner, generator = run_stage(policy, stage, config=PPOConfig(epochs=4, minibatches=4), n=32)
     held_out, _, _ = run_stage(policy, stage, seed=1, n=32)
+    buffer, learner, generator = run_stage(policy, stage, config=PPOConfig(epochs=4, minibatches=4), n=32)
 
     def error():
         with torch.no_grad():

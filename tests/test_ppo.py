@@ -72,7 +72,8 @@ def rollout(policy_name="rolt", num_envs=8):
     torch.manual_seed(0)
     env = LocomotionEnv("a1", num_envs, 0, 1, TASKS["stiffness"].training)
     observation = env.reset(random_ages=True)
-    policy, critic = make_policy(policy_name, env.robot), Critic(observation)
+    policy = make_policy(policy_name, env.robot)
+    critic = Critic(observation, policy.normalizer)
     torch.nn.init.normal_(policy.decoder.weight, std=0.2)  # as in a trained policy, dropout shows in the actions
     generator = torch.Generator().manual_seed(0)
     masks = policy.sample_masks(num_envs, generator)
@@ -111,7 +112,7 @@ def test_first_minibatch_of_an_update_has_ratio_one():
 def test_micro_batches_sum_to_the_minibatch(monkeypatch):
     gradients = []
     for size in (192, 50):
-        monkeypatch.setattr("ppo.MICRO_BATCH", size)
+        monkeypatch.setattr("rolt.ROLT.micro_batch", size)
         policy, critic, buffer, generator = rollout()
         learner = Learner(policy, critic, PPOConfig(epochs=1, minibatches=1))
         learner.update(buffer, generator)

@@ -1,6 +1,7 @@
 """The scripts as a user runs them: train, resume, evaluate, render; and what they say to wrong input."""
 
 import csv
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -11,8 +12,8 @@ import torch
 import checkpoint
 import evaluate
 import train
-from baselines import make_policy
-from robots import A1
+from baselines import METHODS, make_policy
+from robots import A1, ROBOTS
 
 ROOT = Path(__file__).resolve().parent.parent
 SMALL = ["--envs", "8", "--minibatches", "2", "--epochs", "1"]
@@ -75,6 +76,62 @@ def test_two_processes_train_one_policy(tmp_path):
     other = run(*command, "--resume", "--seed", "1", cwd=tmp_path)
     assert other.returncode == 2 and "seed was 0, is 1" in other.stderr
     assert (tmp_path / "run" / "policy.pt").read_bytes() == before
+
+
+@pytest.mark.parametrize("policy", ["rma", "roam"])
+def test_a_run_of_several_stages_goes_on_to_the_bit(policy, tmp_path, monkeypatch, capsys):
+    """Ten iterations, nine tenths of them for the first stages; interrupted in a first and in the last stage."""
+    common = ["--policy", policy, "--threads", "1", *SMALL, "--steps", "1920"]
+    whole, broken = tmp_path / "whole", tmp_path / "broken"
+    train.main([*common, "--out", str(whole)])
+    summarise, calls = train.summarise, []
+
+    def interrupt(*arguments):
+        calls.append(1)
+        if len(calls) in (3, 9):
+            signal.raise_signal(signal.SIGINT)
+        return summarise(*arguments)
+
+    monkeypatch.setattr(train, "summarise", interrupt)
+    for resume in ([], ["--resume"], ["--resume"]):
+        train.main([*common, "--out", str(broken), *resume])
+    stages = [row["stage"] for row in rows(whole / "progress.csv")]
+    assert stages == (["0"] * 9 + ["1"] if policy == "rma" else ["0"] * 5 + ["1"] * 4 + ["2"])
+    assert [row["stage"] for row in rows(broken / "progress.csv")] == stages
+    assert all(torch.equal(a, b) for a, b in zip(weights(broken).values(), weights(whole).values()))
+    with pytest.raises(SystemExit):
+        train.main([*common, "--out", str(whole), "--resume", "--steps", "3840"])
+    assert "steps was 1920, is 3840" in capsys.readouterr().err
+
+
+def test_all_methods_in_turn_and_evaluated_together(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    command = ["--policy", "all", "--threads", "1", *SMALL, "--steps", "192"]
+    train.main(command)
+    files = [f"runs/a1-stiffness-{name}-seed0/policy.pt" for name in METHODS]
+    before = [Path(file).stat().st_mtime_ns for file in files]
+    train.main(command)  # all is finished: nothing is touched
+    assert [Path(file).stat().st_mtime_ns for file in files] == before
+    quick = ["--episodes", "1", "--seconds", "0.1", "--out", "out"]
+    evaluate.main(["stiffness", "--checkpoints", *files, *quick])
+    assert list(dict.fromkeys(row["method"] for row in rows(Path("out/stiffness.csv")))) == list(METHODS)
+    capsys.readouterr()
+    evaluate.main(["dropout_ratio", "--checkpoints", files[-1], "--out", "out"])
+    table = {(row["masks"], float(row["rate"])): row for row in rows(Path("out/dropout_ratio.csv"))}
+    assert all(float(table["stored", rate][k]) == pytest.approx(1, abs=1e-4) for rate in (1e-4, 0.2) for k in ("low", "high"))
+    assert float(table["fresh", 0.2]["high"]) > 1.01 > float(table["none", 1e-4]["high"])
+    with pytest.raises(SystemExit):
+        evaluate.main(["dropout_ratio", "--checkpoints", files[0], "--out", "out"])
+    assert "for rolt, not for mlp" in capsys.readouterr().err
+
+
+def test_damage_test_stands_beside_the_papers(tmp_path, capsys):
+    card = {"robot": "hexapod", "task": "damage", "policy": "rolt", "steps": 0, "seed": 0}
+    checkpoint.save(card | {"weights": make_policy("rolt", ROBOTS["hexapod"]).state_dict()}, tmp_path / "policy.pt")
+    evaluate.main(["damage", "--checkpoints", str(tmp_path / "policy.pt"), "--episodes", "1", "--seconds", "0.1", "--out", str(tmp_path)])
+    cases = [row["case"] for row in rows(tmp_path / "damage.csv")]
+    assert cases == "healthy FRT MRT MLC FLC FLT FRC MRC MLT HLT HLC HRT HRC".split()
+    assert "14.28 ± 2.93" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
