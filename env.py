@@ -22,9 +22,8 @@ What a policy sees (`Observation`); scales are legged_gym's:
                                 its yaw (the ground is flat so far)
 
 Angles are absolute, as the paper writes ("joints' position", "the last output target angles"; legged_gym subtracts the
-default pose). It matters: the default pose is not the same on every leg (the A1's hips are turned outwards, to
--0.1 right and +0.1 left), so ROLT can tell left from right from the start. With differences it had to
-find that out from noise, and stood still, unable to turn, for 0.8 million steps.
+default pose). The default pose differs a little from leg to leg (the A1's hips are turned outwards, to -0.1 right and
++0.1 left), which helps ROLT to tell its legs apart.
 
 And what only some baselines read, empty (N, 0) unless named in `extras`:
 
