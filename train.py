@@ -48,7 +48,7 @@ def parse_arguments(argv: list[str] | None = None):
     parser.add_argument("--robot", choices=ROBOTS, default="a1")
     parser.add_argument("--task", choices=TASKS, help="which faults are trained, see faults.py (default: the robot's first)")
     parser.add_argument("--policy", choices=(*METHODS, "all"), default="rolt")
-    parser.add_argument("--envs", type=count, default=256, help="robots simulated at once")
+    parser.add_argument("--envs", type=count, default=512, help="robots simulated at once")
     parser.add_argument("--steps", type=count, default=6_000_000, help="env steps in total, over all robots")
     parser.add_argument("--epochs", type=count, default=PPOConfig.epochs, help="of PPO, over each rollout")
     parser.add_argument("--minibatches", type=count, default=PPOConfig.minibatches, help="an epoch")
