@@ -9,6 +9,8 @@ Two kinds, both of torch.save, both dictionaries of plain values and tensors:
 """
 
 import os
+import shutil
+import zipfile
 from pathlib import Path
 
 import torch
@@ -39,12 +41,44 @@ def save(content: dict, path: Path) -> None:
         raise OSError(f"cannot write {path}: {error}; what was saved there before is untouched") from error
 
 
+def save_next(content: dict, path: Path) -> None:
+    """`save`, with what was there before kept beside it as NAME.previous."""
+    if path.exists():
+        previous = path.with_name(path.name + ".previous")
+        previous.unlink(missing_ok=True)
+        try:
+            os.link(path, previous)  # a second name for the old file, which `save` then replaces
+        except OSError:  # a file system without links
+            shutil.copyfile(path, previous)
+    save(content, path)
+
+
+def load_newest(path: Path, say: bool = False) -> dict:
+    """The file at `path`, or else the one before it (see `save_next`), and says so if `say`.
+
+    CheckpointError if neither can be used.
+    """
+    try:
+        return load(path)
+    except CheckpointError as error:
+        try:
+            content = load(path.with_name(path.name + ".previous"))
+        except CheckpointError:
+            raise error from None
+        if say:
+            print(f"{error}; going on from the one before it", flush=True)
+        return content
+
+
 def load(path: str | Path) -> dict:
     """The dictionary in the file. CheckpointError if it is missing, damaged or of another format."""
     path = Path(path)
     if not path.is_file():
         raise CheckpointError(f"there is no checkpoint {path}")
     try:
+        with zipfile.ZipFile(path) as archive:  # what torch.save writes; torch.load does not look at its checksums
+            if altered := archive.testzip():
+                raise ValueError(f"the checksum of {altered} is wrong")
         content = torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:  # whatever damaged bytes provoke in zip, pickle or torch
         raise CheckpointError(f"{path} is not a whole checkpoint ({type(error).__name__}): copy or train it again") from error

@@ -51,8 +51,10 @@ import numpy as np
 from mujoco.batch import Batch
 
 from faults import Fault, healthy, write_fault
-from rewards import total_reward
+from rewards import FALL, total_reward
 from robots import PHYSICS_DT, ROBOTS, Robot, build_model
+
+mujoco.set_mju_user_warning(lambda message: None)  # divergences are counted below; not on stderr and in MUJOCO_LOG.TXT
 
 SUBSTEPS = 4  # legged_gym: 50 Hz control
 CONTROL_DT = SUBSTEPS * PHYSICS_DT  # s
@@ -207,9 +209,10 @@ class LocomotionEnv:
         self._read_state()
         self._read_feet()
         reward, terms = total_reward(self, CONTROL_DT)
+        fallen = (self._contacts[:, self._trunk_sensor] > 0).any(axis=1) | (self.gravity[:, 2] > -MAX_TILT)
+        reward += FALL * fallen
         reward[diverged] = 0.0
         self.episode_return += reward
-        fallen = (self._contacts[:, self._trunk_sensor] > 0).any(axis=1) | (self.gravity[:, 2] > -MAX_TILT)
         terminated = fallen | diverged
         truncated = (self.age >= self.episode_steps) & ~terminated
         self.air_time *= ~self.foot_contact

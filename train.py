@@ -190,7 +190,7 @@ def train(rank: int, args, sync: str | None) -> None:
     iteration, steps = 0, 0
 
     if args.resume:
-        saved = checkpoint.load(args.out / "checkpoint.pt")
+        saved = checkpoint.load_newest(args.out / "checkpoint.pt")
         iteration, steps = saved["iteration"], saved["steps"]
         if saved["stage"]:
             part = Part(saved["stage"], stages[saved["stage"]], args, rank, policy, device)
@@ -213,7 +213,7 @@ def train(rank: int, args, sync: str | None) -> None:
             checkpoint.save(content, args.out / "policy.pt")
             content |= {"critic": part.critic.state_dict(), "learner": part.learner.state_dict(), "processes": everyone}
             content |= {"iteration": iteration, "stage": part.number, "identity": identity(args)}
-            checkpoint.save(content, args.out / "checkpoint.pt")
+            checkpoint.save_next(content, args.out / "checkpoint.pt")
             learning_curve(args.out / "progress.csv", args.out / "progress.png")
 
     stop = []  # Ctrl-C and SIGTERM end the run after the iteration that they interrupt
@@ -308,7 +308,8 @@ def main(argv: list[str] | None = None) -> None:
     try:
         if args.policy == "all":
             return train_all(sys.argv[1:] if argv is None else argv, args)
-        was = checkpoint.load(args.out / "checkpoint.pt").get("identity", {}) if args.resume else identity(args)
+        saved = checkpoint.load_newest(args.out / "checkpoint.pt", say=True) if args.resume else {"identity": identity(args)}
+        was = saved.get("identity", {})
     except checkpoint.CheckpointError as error:
         fail(error)
     differing = [f"{key} was {was.get(key)}, is {now}" for key, now in identity(args).items() if was.get(key) != now]

@@ -133,8 +133,9 @@ def test_a_robot_on_its_back_has_fallen_and_the_others_go_on():
     env = LocomotionEnv("a1", 3, num_threads=1)
     env.reset()
     env._qpos[1, 3:7] = [0, 1, 0, 0]
-    _, _, terminated, truncated, info = env.step(np.zeros((3, 12)))
+    _, reward, terminated, truncated, info = env.step(np.zeros((3, 12)))
     assert terminated.tolist() == [False, True, False] and not truncated.any()
+    assert reward[1] == pytest.approx(rewards.FALL, abs=0.05) and (reward[[0, 2]] >= 0).all()  # a fall costs, once
     assert env.age.tolist() == [1, 0, 1] and len(info["episode_returns"]) == 1
     assert env.gravity[1, 2] == pytest.approx(-1)  # upright again
 
@@ -146,7 +147,8 @@ def test_trunk_on_the_ground_is_a_fall():
     assert env.step(np.zeros((1, 12)))[2].all()
 
 
-def test_diverged_simulation_is_ended_counted_and_harms_nobody():
+def test_diverged_simulation_is_ended_counted_and_harms_nobody(tmp_path, monkeypatch, capfd):
+    monkeypatch.chdir(tmp_path)
     quiet = EnvConfig(start_speed=0.0, push_speed=0.0)
     env, twin = (LocomotionEnv("a1", 3, num_threads=1, config=quiet) for _ in range(2))
     env.reset(), twin.reset()
@@ -159,6 +161,7 @@ def test_diverged_simulation_is_ended_counted_and_harms_nobody():
     assert np.array_equal(observation.legs[[0, 2]], expected.legs[[0, 2]])
     _, _, terminated, _, info = env.step(np.zeros((3, 12)))
     assert not info["diverged"].any() and not terminated.any()
+    assert not list(tmp_path.iterdir()) and capfd.readouterr().err == ""  # counted, not told by MuJoCo in its own way
 
 
 def test_wrong_use_is_refused():

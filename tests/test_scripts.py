@@ -203,6 +203,22 @@ def test_a_failed_save_keeps_the_former_file(tmp_path, monkeypatch):
     assert [file.name for file in tmp_path.iterdir()] == ["policy.pt"]
 
 
+def test_one_altered_byte_is_noticed_and_the_file_before_is_used(tmp_path):
+    path = tmp_path / "checkpoint.pt"
+    for value in (1.0, 2.0, 3.0):
+        checkpoint.save_next({"weights": torch.full((1000,), value)}, path)
+    assert checkpoint.load_newest(path)["weights"][0] == 3.0
+    content = bytearray(path.read_bytes())
+    content[content.index(torch.full((4,), 3.0).numpy().tobytes()) + 6] ^= 1
+    path.write_bytes(content)
+    with pytest.raises(checkpoint.CheckpointError, match="not a whole checkpoint"):
+        checkpoint.load(path)
+    assert checkpoint.load_newest(path)["weights"][0] == 2.0
+    (tmp_path / "checkpoint.pt.previous").write_text("gone, too")
+    with pytest.raises(checkpoint.CheckpointError):
+        checkpoint.load_newest(path)
+
+
 def test_a_checkpoint_is_never_executed(tmp_path):
     class Evil:
         def __reduce__(self):
