@@ -130,8 +130,8 @@ class RollDrop(MLP):
 
 
 class RMA(nn.Module):
-    """Rapid motor adaptation. Stage 1, PPO: base(proprioception, heights, z) with z = encoder(privileged). Stage 2, supervised:
-    adaptation(past 50 steps) learns to say z while it drives the frozen base.
+    """Rapid motor adaptation. Stage 1, PPO: base(proprioception, heights, z) with z = encoder(privileged). Stage 2,
+    supervised: adaptation(past 50 steps) learns to say z while it drives the frozen base.
 
     Whether z is known or guessed follows from the observation: where `past` is there, it is guessed. At test only
     `past` is there.
@@ -220,8 +220,8 @@ class AdaptationLearner(Learner):
 class ROAM(nn.Module):
     """Robust autonomous modulation: at each step, act by behaviour i ~ softmax(V_1(s), ..., V_K(s)).
 
-    Every behaviour is an MLP that was trained in one situation. In the last stage each acts in its own situation (the observation
-    names it) and the values learn who belongs where.
+    Every behaviour is an MLP that was trained in one situation. In the last stage each acts in its own situation (the
+    observation names it) and the values learn who belongs where.
     """
 
     extras = ()

@@ -91,11 +91,13 @@ def main(argv: list[str] | None = None) -> None:
     total, bare = time_simulation(args.robot, args.envs, args.threads)
     steps = 140 * args.envs
     print(f"simulation  env.step takes {total / bare:.2f} times its bare Batch.step")
-    print(f"            {steps / total:,.0f} env steps/s, bare {steps / bare:,.0f} ({args.envs} robots, {args.threads} threads)")
+    rates = f"{steps / total:,.0f} env steps/s, bare {steps / bare:,.0f}"
+    print(f"            {rates} ({args.envs} robots, {args.threads} threads)")
     torch.set_num_threads(1)
     network, plain, work = time_learner(args.robot, ROLT.micro_batch)
     print(f"learner     forward and backward run at {plain / network:.0%} of the rate of their matrix products")
-    print(f"            {ROLT.micro_batch / network:,.0f} samples/s, {work / network:.0f} GFLOP/s of {work / plain:.0f} (one thread)")
+    rates = f"{ROLT.micro_batch / network:,.0f} samples/s, {work / network:.0f} GFLOP/s of {work / plain:.0f}"
+    print(f"            {rates} (one thread)")
 
 
 if __name__ == "__main__":

@@ -73,7 +73,10 @@ def stiffness(args) -> None:
     seen = [fault for _, fault in task.training]
     cases = {"healthy" if f == healthy() else f.locked[0].split("_")[0]: f for f in (*seen, *task.unseen)}
     rows = run_cases(args, cases, speed=0.75)
-    marked = [f"{case}{'' if case == 'healthy' else ' locked'} ({'seen' if f in seen else 'unseen'})" for case, f in cases.items()]
+    marked = [
+        f"{case}{'' if case == 'healthy' else ' locked'} ({'seen' if fault in seen else 'unseen'})"
+        for case, fault in cases.items()
+    ]
     report(args, rows, list(cases), marked, "stiffness", f"Stiffness test: {args.robot}, 0.75 m/s, {args.seconds:g} s")
 
 
@@ -103,8 +106,8 @@ def dropout_ratio(args) -> None:
     """Not in the paper, but its case for consistency (section III-C) in one picture: PPO's ratio before any weight has
     moved, where it should be 1.
 
-    The shipped ROLT collects a rollout with feature dropout at each rate (PE dropout off). Then the update's probability of the
-    same actions is computed with the stored masks (consistent dropout), with fresh masks (ordinary dropout) and
+    The shipped ROLT collects a rollout with feature dropout at each rate (PE dropout off). Then the update's probability
+    of the same actions is computed with the stored masks (consistent dropout), with fresh masks (ordinary dropout) and
     without masks (what Roll-Drop does).
     """
     (path, (policy, _)), rows = next(iter(args.policies.items())), []
@@ -164,7 +167,8 @@ def run_cases(args, cases: dict[str, Fault], speed: float) -> list[dict]:
 
 
 def report(args, rows: list[dict], cases: list[str], labels: list[str], name: str, title: str, paper: dict = {}) -> None:
-    """Prints the tables (mean +- sd over episodes; the paper's own, where it has numbers), writes the CSV file and the bar charts.
+    """Prints the tables (mean ± sd over episodes; the paper's own, where it has numbers), writes the CSV file and the
+    bar charts.
 
     cases, labels: as in `rows`, and as they are to be shown. paper: {column: {method: {case: (mean, sd)}}}.
     """

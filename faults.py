@@ -147,7 +147,9 @@ TASKS = {
         ),
         unseen=tuple(
             disable(joint)
-            for joint in ("FL_calf", "FL_thigh", "FR_calf", "MR_calf", "ML_thigh", "HL_thigh", "HL_calf", "HR_thigh", "HR_calf")
+            for joint in (
+                "FL_calf", "FL_thigh", "FR_calf", "MR_calf", "ML_thigh", "HL_thigh", "HL_calf", "HR_thigh", "HR_calf",
+            )
         ),
     ),
 }

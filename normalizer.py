@@ -49,7 +49,10 @@ class Normalizer(nn.Module):
 
     @torch.no_grad()
     def update(self, observation: Observation, sum_over_processes) -> None:
-        """Takes in the observations of a rollout, (T, N, ...) or (B, ...) fields. The second argument adds up a tensor over all processes."""
+        """Takes in the observations of a rollout, (T, N, ...) or (B, ...) fields.
+
+        sum_over_processes adds up a tensor over all of them (ppo.all_reduce).
+        """
         legs, heights = observation.legs[..., -1, :], observation.heights  # the newest step: older ones were newest once
         rows = {"legs": legs.flatten(0, -2), "heights": heights.reshape(-1, 1)}
         if len(self.privileged_mean):

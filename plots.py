@@ -60,11 +60,16 @@ def bar_charts(
 
 def ratio_bands(rows: list[dict], picture: Path, title: str) -> None:
     """PPO's ratio against the dropout rate, a band for each way to treat the masks, and the share that PPO clips."""
-    labels = {"stored": "stored masks (consistent dropout)", "fresh": "fresh masks (ordinary dropout)", "none": "no masks (Roll-Drop)"}
+    labels = {
+        "stored": "stored masks (consistent dropout)",
+        "fresh": "fresh masks (ordinary dropout)",
+        "none": "no masks (Roll-Drop)",
+    }
     figure, (left, right) = plt.subplots(1, 2, figsize=(10.4, 3.8), layout="constrained")
     for masks, label in labels.items():
         mine = [row for row in rows if row["masks"] == masks]
-        rate, low, median, high, clipped = (np.array([row[k] for row in mine]) for k in ("rate", "low", "median", "high", "clipped"))
+        columns = ("rate", "low", "median", "high", "clipped")
+        rate, low, median, high, clipped = (np.array([row[column] for row in mine]) for column in columns)
         (line,) = left.plot(rate, median, marker="o", markersize=3, label=label)
         left.fill_between(rate, low, high, alpha=0.2, color=line.get_color())
         right.plot(rate, 100 * clipped, marker="o", markersize=3, label=label)

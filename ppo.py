@@ -26,9 +26,9 @@ from normalizer import Normalizer
 @dataclass(frozen=True)
 class PPOConfig:
     steps: int = 24  # T, control steps of an iteration, legged_gym
-    # ours: 1 of 12 minibatches of 1024 samples at 512 robots (legged_gym: 5 of 4, of 24576 at 4096). At this size the gradient
-    # is mostly noise: of what an update gained on its own rollout, fresh rollouts of the same policy saw a tenth. New
-    # samples cost a laptop little more than old ones, and do not repeat their noise.
+    # ours: 1 of 12 minibatches of 1024 samples at 512 robots (legged_gym: 5 of 4, of 24576 at 4096). At this size the
+    # gradient is mostly noise: of what an update gained on its own rollout, fresh rollouts of the same policy saw a
+    # tenth. New samples cost a laptop little more than old ones, and do not repeat their noise.
     epochs: int = 1
     minibatches: int = 12
     discount: float = 0.99  # gamma, legged_gym
@@ -37,7 +37,7 @@ class PPOConfig:
     entropy_weight: float = 0.005  # ours: legged_gym's 0.01 keeps sigma from shrinking within a short run
     value_weight: float = 1.0  # legged_gym
     max_gradient_norm: float = 1.0  # legged_gym
-    learning_rate: float = 1e-4  # at the start, ours: a transformer at legged_gym's 1e-3 jumps (KL of 8) before the rule reacts
+    learning_rate: float = 1e-4  # at the start, ours: at legged_gym's 1e-3 a transformer jumps before the rule reacts
     target_kl: float = 0.01  # legged_gym: the policy's learning rate follows it (see adapt_learning_rate)
     critic_learning_rate: float = 1e-3  # legged_gym's at the start; it has no KL to follow
 

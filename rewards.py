@@ -76,9 +76,9 @@ REWARDS = {
 }
 
 
-# Added for a fall, once, after the floor. Ours: legged_gym has such a term, -4 for its Cassie and 0 for its A1. With 0 and the few
-# robots of a laptop, ROLT found that to lunge forward, fall and be put up again pays as much as to stand; it still did after
-# 0.9 million steps.
+# Added for a fall, once, after the floor. Ours: legged_gym has such a term, -4 for its Cassie and 0 for its A1. With 0
+# and the few robots of a laptop, ROLT found that to lunge forward, fall and be put up again pays as much as to stand; it
+# still did after 0.9 million steps.
 FALL = -1.0
 
 

@@ -247,9 +247,9 @@ GO1 = Robot(
 )  # fmt: skip
 
 # ElSpider Air, 30.5 kg: the hexapod of the authors' laboratory (the paper names none). Source: extended_legged_gym
-# el_mini.urdf (masses, inertias, geometry, limits) and elspider_air.h (pose, gains). The hips turn about the vertical, the thighs
-# point up and the calves down. The foot (0.019 kg) is part of the calf. Links are capsules as thick as their boxes.
-# Ours, where the sources are silent: armature and dry friction (the A1's), the start height.
+# el_mini.urdf (masses, inertias, geometry, limits) and elspider_air.h (pose, gains). The hips turn about the vertical,
+# the thighs point up and the calves down. The foot (0.019 kg) is part of the calf. Links are capsules as thick as
+# their boxes. Ours, where the sources are silent: armature and dry friction (the A1's), the start height.
 HEXAPOD = Robot(
     name="hexapod",
     trunk_mass=15.8991,
@@ -257,7 +257,8 @@ HEXAPOD = Robot(
     trunk_inertia=(0.0926086, 0.47054913, 0.53896766, 0, 0, 0),
     trunk_box=(0.6, 0.28, 0.14),
     legs=("FR", "FL", "MR", "ML", "HR", "HL"),
-    mounts=((0.3, -0.08, 0.011), (0.3, 0.08, 0.011), (0, -0.14, 0.011), (0, 0.14, 0.011), (-0.3, -0.08, 0.011), (-0.3, 0.08, 0.011)),
+    mounts=((0.3, -0.08, 0.011), (0.3, 0.08, 0.011), (0, -0.14, 0.011), (0, 0.14, 0.011),
+            (-0.3, -0.08, 0.011), (-0.3, 0.08, 0.011)),
     links=(
         Link("hip", 1.20924, (-0.01147, -0.12306, -0.03644),
              (0.00506, 0.00134, 0.00448, -3.8e-4, -1.2e-4, -1.02e-3),

@@ -238,7 +238,8 @@ def train(rank: int, args, sync: str | None) -> None:
         overdue = rank == 0 and time.time() - saved_at > 60 * args.save_minutes
         shared = sum_over_processes(means | sums | {"stop": bool(stop), "save": overdue}, device)  # all must agree
         if rank == 0:
-            row = {"iteration": iteration, "steps": steps, "stage": part.number} | {name: shared[name] / args.processes for name in means}
+            row = {"iteration": iteration, "steps": steps, "stage": part.number}
+            row |= {name: shared[name] / args.processes for name in means}
             row |= {"sigma": part.actor.sigma().mean().item(), "learning_rate": part.learner.learning_rate} | losses
             row |= {"collect_seconds": collected - started, "update_seconds": updated - collected}
             progress.log(row | {"divergences": int(shared["divergences"])}, shared)

@@ -40,7 +40,8 @@ def test_two_processes_see_what_one_would():
     # the sum over two processes, of which the other one holds `right`
     other, sums = Normalizer(3), []
     other.update(right, lambda tensor: sums.append(tensor.clone()) or tensor * 1.0)
-    theirs = iter([sums[0], *(mean * sums[0] for mean in (other.legs_mean, other.legs_square, other.heights_mean, other.heights_square))])
+    means = other.legs_mean, other.legs_square, other.heights_mean, other.heights_square
+    theirs = iter([sums[0], *(mean * sums[0] for mean in means)])
     half.update(left, lambda tensor: tensor + next(theirs))
     for key, value in whole.state_dict().items():
         assert torch.allclose(half.state_dict()[key], value), key

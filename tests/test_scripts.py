@@ -128,7 +128,8 @@ def test_all_methods_in_turn_and_evaluated_together(tmp_path, monkeypatch, capsy
 def test_damage_test_stands_beside_the_papers(tmp_path, capsys):
     card = {"robot": "hexapod", "task": "damage", "policy": "rolt", "steps": 0, "seed": 0}
     checkpoint.save(card | {"weights": make_policy("rolt", ROBOTS["hexapod"]).state_dict()}, tmp_path / "policy.pt")
-    evaluate.main(["damage", "--checkpoints", str(tmp_path / "policy.pt"), "--episodes", "1", "--seconds", "0.1", "--out", str(tmp_path)])
+    quick = ["--episodes", "1", "--seconds", "0.1", "--out", str(tmp_path)]
+    evaluate.main(["damage", "--checkpoints", str(tmp_path / "policy.pt"), *quick])
     cases = [row["case"] for row in rows(tmp_path / "damage.csv")]
     assert cases == "healthy FRT MRT MLC FLC FLT FRC MRC MLT HLT HLC HRT HRC".split()
     assert "14.28 ± 2.93" in capsys.readouterr().out
