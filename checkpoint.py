@@ -5,7 +5,7 @@ Two kinds, both of torch.save, both dictionaries of plain values and tensors:
                    what evaluate.py reads, and the kind of file for checkpoints/.
     checkpoint.pt  the same and everything else that training needs to go on: `train.py --resume`.
 
-    >>> policy, card = load_policy("runs/a1-stiffness-rolt-seed0/policy.pt")
+    >>> policy, card = load_policy("checkpoints/a1-stiffness-rolt.pt")
 """
 
 import os

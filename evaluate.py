@@ -10,6 +10,7 @@ Policies act by their mean, without dropout. The same seed and the same number o
 """
 
 import csv
+import os
 from dataclasses import replace
 from pathlib import Path
 
@@ -213,11 +214,13 @@ def find_policies(args) -> dict[Path, tuple]:
     else:
         _, task, suitable = EXPERIMENTS[args.experiment]
         wanted = args.methods or suitable
-        shipped = Path(__file__).parent / "checkpoints"
+        shipped = Path(os.path.relpath(Path(__file__).parent / "checkpoints"))
         named = {method: shipped / f"{args.robot}-{task}-{method}.pt" for method in wanted}
         paths = [path for path in named.values() if path.is_file()]
-        for method in (m for m, path in named.items() if not path.is_file()):
-            print(f"no checkpoint of {method} yet: python train.py --robot {args.robot} --task {task} --policy {method}")
+        missing = [method for method, path in named.items() if not path.is_file()]
+        if missing:
+            train = f"python train.py --robot {args.robot} --task {task} --policy {missing[0] if len(missing) == 1 else 'all'}"
+            print(f"not trained yet: {', '.join(missing)}; {train}, then --checkpoints")
         if not paths:
             fail("nothing to evaluate: name files with --checkpoints")
     try:

@@ -49,11 +49,14 @@ def bar_charts(
         for i, (method, (mean, deviation)) in enumerate(methods.items()):
             x = np.arange(len(cases)) + (i - (len(methods) - 1) / 2) * width
             axis.bar(x, mean, width, yerr=deviation, capsize=2, label=method, error_kw={"linewidth": 0.8})
-        axis.set_xticks(np.arange(len(cases)), cases, fontsize=8)
+        axis.set_xticks(np.arange(len(cases)), [case.replace(" (", "\n(") for case in cases], fontsize=8)
         axis.set_ylabel(label)
         axis.set_ylim(bottom=min(0, axis.get_ylim()[0]))
         axis.grid(axis="y", alpha=0.3)
-    axes[0, -1].legend(fontsize=8, frameon=False, loc="lower right")
+    if len(methods) > 1:
+        axes[0, -1].legend(fontsize=8, frameon=False, loc="lower right")
+    else:
+        title = f"{title}, {', '.join(methods)}"
     figure.suptitle(title, fontsize=10)
     save_figure(figure, picture)
 

@@ -1,7 +1,7 @@
 """Pictures of a robot that walks: a strip of frames (.png) or a moving picture (.gif).
 
-    python render.py runs/a1-stiffness-rolt-seed0/policy.pt --fault lock:FL_calf --out limping.gif
-    python render.py runs/a1-stiffness-rolt-seed0/policy.pt --fault healthy lock:FR_calf --out strip.png
+    python render.py checkpoints/a1-stiffness-rolt.pt --fault lock:FL_calf --out limping.gif
+    python render.py checkpoints/a1-stiffness-rolt.pt --fault healthy lock:FR_calf --out strip.png
 
 Works without a display through EGL (set MUJOCO_GL yourself for another way, such as osmesa).
 """
