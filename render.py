@@ -67,6 +67,8 @@ def film(
         if terminated[0]:
             break
     renderer.close()
+    if not frames:
+        raise ValueError(f"with {fault} the robot falls within {warm_up:g} s: there is nothing to show")
     return frames
 
 

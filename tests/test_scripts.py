@@ -13,6 +13,7 @@ import checkpoint
 import evaluate
 import train
 from baselines import METHODS, make_policy
+from plots import learning_curve
 from robots import A1, ROBOTS
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -229,6 +230,13 @@ def test_a_checkpoint_is_never_executed(tmp_path):
     with pytest.raises(checkpoint.CheckpointError):
         checkpoint.load(tmp_path / "evil.pt")
     assert not (tmp_path / "executed").exists()
+
+
+def test_a_torn_row_does_not_stop_the_learning_curve(tmp_path):
+    header = "steps,speed,commanded_speed,episode_return,episode_seconds,sigma,kl"
+    (tmp_path / "progress.csv").write_text(f"{header}\n1,0,0,1,1,1,0\n2,0,0\n3,0,0,1,1,1,0,9\n4,0,0,1,1,1,0\n")
+    learning_curve(tmp_path / "progress.csv", tmp_path / "progress.png")
+    assert (tmp_path / "progress.png").stat().st_size > 1000
 
 
 def test_pictures_are_written(tmp_path):
