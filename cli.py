@@ -6,6 +6,11 @@ import sys
 from pathlib import Path
 from typing import NoReturn
 
+try:
+    import fcntl
+except ImportError:  # Windows
+    fcntl = None
+
 
 def fail(message: object) -> NoReturn:
     """One line on stderr, exit code 2."""
@@ -56,6 +61,19 @@ def positive(text: str) -> float:
 def num_cores() -> int:
     """Cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def lock_folder(path: Path):
+    """Keeps other processes from training into the folder, until the returned file is closed; ends the program if one does
+    so already. (Where the system has no such locks, nothing happens.)"""
+    if fcntl is None:
+        return None
+    file = open(path / ".lock", "w")
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        fail(f"another process is training into {path}: wait for it, or choose another --out or --seed")
+    return file
 
 
 def writable_folder(path: Path) -> Path:

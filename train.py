@@ -30,7 +30,7 @@ from torch import nn
 
 import checkpoint
 from baselines import METHODS, Stage, make_policy, training_stages
-from cli import Parser, count, fail, num_cores, positive, seed, writable_folder
+from cli import Parser, count, fail, lock_folder, num_cores, positive, seed, writable_folder
 from env import CONTROL_DT, LocomotionEnv
 from faults import TASKS
 from plots import learning_curve
@@ -316,6 +316,7 @@ def main(argv: list[str] | None = None) -> None:
     differing = [f"{key} was {was.get(key)}, is {now}" for key, now in identity(args).items() if was.get(key) != now]
     if differing:
         fail(f"the run in {args.out} was another one: {'; '.join(differing)}")
+    lock = lock_folder(args.out) if os.environ.get("RANK", "0") == "0" else None  # noqa: F841 (held until the end)
     if "RANK" in os.environ:  # started by torchrun, which has made the processes
         guarded(int(os.environ["RANK"]), args, "env://")
     elif args.processes == 1:

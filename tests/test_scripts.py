@@ -10,6 +10,7 @@ import pytest
 import torch
 
 import checkpoint
+import cli
 import evaluate
 import train
 from baselines import METHODS, make_policy
@@ -230,6 +231,17 @@ def test_a_checkpoint_is_never_executed(tmp_path):
     with pytest.raises(checkpoint.CheckpointError):
         checkpoint.load(tmp_path / "evil.pt")
     assert not (tmp_path / "executed").exists()
+
+
+def test_two_trainings_never_share_a_folder(tmp_path, capsys):
+    lock = cli.lock_folder(tmp_path)
+    if lock is None:
+        pytest.skip("this system has no file locks")
+    with pytest.raises(SystemExit) as ended:
+        train.main(["--threads", "1", *SMALL, "--steps", "192", "--out", str(tmp_path)])
+    assert ended.value.code == 2 and "another process is training" in capsys.readouterr().err
+    lock.close()
+    train.main(["--threads", "1", *SMALL, "--steps", "192", "--out", str(tmp_path)])
 
 
 def test_a_torn_row_does_not_stop_the_learning_curve(tmp_path):
