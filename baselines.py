@@ -64,13 +64,25 @@ def proprioception(legs: Tensor) -> Tensor:
     return torch.cat([legs[..., :-12].transpose(1, 2).flatten(2), legs[:, 0, :, -12:]], dim=2)
 
 
-class MLP(nn.Module):
-    """One network for everything."""
+class Policy(nn.Module):
+    """What the baselines share unless they say otherwise (the words are explained in ROLT)."""
 
     extras = ()
-    height_noise = HEIGHT_NOISE
-    replays_masks = True  # there are none
+    height_noise = 0.0
+    replays_masks = True
     micro_batch = 1024  # more than ROLT's: wide layers and few activations
+
+    def sigma(self) -> Tensor:
+        return self.log_sigma.clamp(*SIGMA_BOUNDS).exp()
+
+    def sample_masks(self, n: int, generator: torch.Generator) -> Masks:
+        return {}
+
+
+class MLP(Policy):
+    """One network for everything."""
+
+    height_noise = HEIGHT_NOISE
 
     def __init__(self, num_legs: int, num_joints: int):
         super().__init__()
@@ -80,12 +92,6 @@ class MLP(nn.Module):
         self.hidden = nn.ModuleList(nn.Linear(a, b) for a, b in zip(sizes, sizes[1:]))
         self.decoder = action_layer(sizes[-1], A)
         self.log_sigma = nn.Parameter(torch.full((A,), INITIAL_SIGMA).log())
-
-    def sigma(self) -> Tensor:
-        return self.log_sigma.clamp(*SIGMA_BOUNDS).exp()
-
-    def sample_masks(self, n: int, generator: torch.Generator) -> Masks:
-        return {}
 
     def forward(self, observation: Observation, masks: Masks | None = None) -> Tensor:
         x = everything(self.normalizer(observation))
@@ -129,7 +135,7 @@ class RollDrop(MLP):
 # ---------------------------------------------------------------------- RMA
 
 
-class RMA(nn.Module):
+class RMA(Policy):
     """Rapid motor adaptation. Stage 1, PPO: base(proprioception, heights, z) with z = encoder(privileged). Stage 2,
     supervised: adaptation(past 50 steps) learns to say z while it drives the frozen base.
 
@@ -139,8 +145,6 @@ class RMA(nn.Module):
 
     extras = ("past",)
     height_noise = HEIGHT_NOISE
-    replays_masks = True  # there are none
-    micro_batch = 1024  # more than ROLT's: wide layers and few activations
 
     def __init__(self, num_legs: int, num_joints: int):
         super().__init__()
@@ -157,8 +161,6 @@ class RMA(nn.Module):
         self.base[-1] = action_layer(HIDDEN[-1], A)
         self.adaptation = Adaptation(frame)
         self.log_sigma = nn.Parameter(torch.full((A,), INITIAL_SIGMA).log())
-
-    sigma, sample_masks = MLP.sigma, MLP.sample_masks
 
     def forward(self, observation: Observation, masks: Masks | None = None) -> Tensor:
         observation = self.normalizer(observation)
@@ -217,17 +219,12 @@ class AdaptationLearner(Learner):
 # ---------------------------------------------------------------------- ROAM
 
 
-class ROAM(nn.Module):
+class ROAM(Policy):
     """Robust autonomous modulation: at each step, act by behaviour i ~ softmax(V_1(s), ..., V_K(s)).
 
     Every behaviour is an MLP that was trained in one situation. In the last stage each acts in its own situation (the
     observation names it) and the values learn who belongs where.
     """
-
-    extras = ()
-    height_noise = 0.0
-    replays_masks = True  # there are none
-    micro_batch = 1024  # more than ROLT's: wide layers and few activations
 
     def __init__(self, num_legs: int, num_joints: int, num_situations: int = 2):
         super().__init__()
@@ -236,8 +233,6 @@ class ROAM(nn.Module):
         self.critics = nn.ModuleList(BehaviourValue(inputs, behaviour.normalizer) for behaviour in self.behaviours)
         self.generator = torch.Generator().manual_seed(0)  # of the choice at test
         self.picked = torch.zeros(num_situations)  # how often each behaviour was chosen at test
-
-    sample_masks = MLP.sample_masks
 
     def sigma(self) -> Tensor:
         return torch.stack([behaviour.sigma() for behaviour in self.behaviours]).mean(0)

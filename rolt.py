@@ -2,7 +2,7 @@
 
 Where each equation is:
     eq. 1  e^l = MLP(s^l)             `leg_embedding`, one network for all legs
-    eq. 2  e^a = W a_{t-1} + b        `action_embedding`, the only thing that tells the legs apart
+    eq. 2  e^a = W a_{t-1} + b        `action_embedding`, by which the legs find out which one they are
     eq. 3  e^prop = [e^l..., e^a]     `tokens`, followed by the 12 height patches e^h = linear(s^h) + p_e
     III-B  two encoder layers, linear decoder on the leg tokens        `EncoderLayer`, `forward`
     III-C  feature dropout and position embedding (PE) dropout         `sample_masks`, `drop`, `tokens`
