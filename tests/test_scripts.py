@@ -60,7 +60,8 @@ def test_train_resume_evaluate(tmp_path, capsys):
         )
     result = rows(tmp_path / "once" / "stiffness.csv")
     assert [row["case"] for row in result[::2]] == ["healthy", "FR", "FL", "RR", "RL"]
-    assert tuple(result[0]) == evaluate.COLUMNS
+    columns = ("method", "checkpoint", "seed", "case", "episode", "distance_m", "fall_time_s", "episode_return")
+    assert tuple(result[0]) == columns
     assert {float(row["fall_time_s"]) for row in result} == {0.4}  # nobody falls that fast
     assert result == rows(tmp_path / "again" / "stiffness.csv")
     assert (tmp_path / "once" / "stiffness.png").stat().st_size > 1000

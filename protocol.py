@@ -1,0 +1,106 @@
+"""What the paper's experiments share: episodes of a policy, the rows of a CSV file, tables and bar charts.
+
+An episode is one robot with one fault, told to walk straight on. Rows of a CSV file are episodes:
+method, checkpoint, seed (of the training), case, episode, distance_m, fall_time_s, episode_return.
+"""
+
+import csv
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from env import CONTROL_DT, EnvConfig, LocomotionEnv
+from faults import Fault
+from plots import bar_charts
+from ppo import to_tensors
+
+
+@torch.no_grad()
+def run_episodes(
+    policy, robot: str, faults: list[Fault], speed: float, seconds: float, seed: int = 0, threads: int = 0
+) -> dict[str, np.ndarray]:
+    """One episode on each of len(faults) robots, robot i with faults[i], told to walk straight on at `speed`.
+
+    Starts vary as in training (pose, velocity, friction); nobody is pushed. A fall is what ends an episode in
+    training: the trunk touches the ground or tilts by more than 60 degrees.
+
+    Returns (N,) each: distance_m, net displacement along the commanded heading up to the first fall or the end;
+    fall_time_s, of the first fall, `seconds` if there is none; episode_return, the reward up to then.
+    """
+    config = EnvConfig(
+        episode_seconds=seconds + 1.0,  # nobody times out before we stop
+        forward_speed=(speed, speed), lateral_speed=(0.0, 0.0), heading=(0.0, 0.0), push_speed=0.0,
+    )  # fmt: skip
+    env = LocomotionEnv(robot, len(faults), seed, threads, config=config, extras=policy.extras)
+    env.pin_faults(faults)
+    observation = env.reset()
+    start, steps = env.position[:, 0].copy(), round(seconds / CONTROL_DT)
+    distance, returns = np.zeros(len(faults)), np.zeros(len(faults))
+    fall_time, upright = np.full(len(faults), seconds), np.ones(len(faults), dtype=bool)
+    for step in range(1, steps + 1):
+        action = policy(to_tensors(observation, "cpu")).numpy()
+        observation, reward, terminated, _, info = env.step(action)
+        valid = upright & ~info["diverged"]  # a diverged simulation's position means nothing: keep the last one
+        distance[valid] = info["position"][valid, 0] - start[valid]
+        returns += upright * reward
+        fall_time[upright & terminated] = step * CONTROL_DT
+        upright &= ~terminated
+        if not upright.any():
+            break
+    return {"distance_m": distance, "fall_time_s": fall_time, "episode_return": returns}
+
+
+def run_cases(args, cases: dict[str, Fault], speed: float) -> list[dict]:
+    """Every checkpoint on every case, `args.episodes` robots each: the rows of the CSV file."""
+    faults = [fault for fault in cases.values() for _ in range(args.episodes)]
+    labels = [(case, episode) for case in cases for episode in range(args.episodes)]
+    rows = []
+    for path, (policy, card) in args.policies.items():
+        print(f"{card['policy']}: {path} ({card['steps'] / 1e6:.1f}M steps, seed {card['seed']})", flush=True)
+        outcome = run_episodes(policy, args.robot, faults, speed, args.seconds, args.seed, args.threads)
+        for i, (case, episode) in enumerate(labels):
+            measured = {name: f"{values[i]:.4f}" for name, values in outcome.items()}
+            row = {"method": card["policy"], "checkpoint": str(path), "seed": card["seed"], "case": case}
+            rows.append(row | {"episode": episode} | measured)
+    return rows
+
+
+def report(args, rows: list[dict], cases: list[str], labels: list[str], name: str, title: str, paper: dict = {}) -> None:
+    """Prints the tables (mean ± sd over episodes; the paper's own, where it has numbers), writes the CSV file and the
+    bar charts.
+
+    cases, labels: as in `rows`, and as they are to be shown. paper: {column: {method: {case: (mean, sd)}}}.
+    """
+    write_csv(args.out / f"{name}.csv", rows)
+    methods, panels = list(dict.fromkeys(row["method"] for row in rows)), {}
+    for column, quantity in (("distance_m", "distance walked [m]"), ("fall_time_s", "time of the first fall [s]")):
+        table = panels[quantity] = {method: mean_and_deviation(rows, method, cases, column) for method in methods}
+        width = max(14, *(len(label) + 2 for label in labels))
+        print(f"\n{quantity:28}" + "".join(f"{label:>{width}}" for label in labels))
+        for method, pairs in table.items():
+            print(f"{method:28}" + "".join(f"{f'{mean:.2f} ± {deviation:.2f}':>{width}}" for mean, deviation in zip(*pairs)))
+            known = paper.get(column, {}).get(method, {})
+            if known:
+                words = ["{:.2f} ± {:.2f}".format(*known[case]) if case in known else "-" for case in cases]
+                print(f"{'  (paper)':28}" + "".join(f"{word:>{width}}" for word in words))
+    print(f"\nepisodes with a fall, of {args.episodes}")
+    for method in methods:
+        mine = [row for row in rows if row["method"] == method]
+        falls = [sum(float(r["fall_time_s"]) < args.seconds for r in mine if r["case"] == case) for case in cases]
+        print(f"{method:28}" + "".join(f"{n:>{width}}" for n in falls))
+    bar_charts(panels, labels, args.out / f"{name}.png", title)
+    print(f"\nwritten: {args.out / f'{name}.csv'}, {args.out / f'{name}.png'}")
+
+
+def mean_and_deviation(rows: list[dict], method: str, cases: list[str], column: str) -> tuple[np.ndarray, np.ndarray]:
+    """Over all episodes (and seeds) of the method, one number a case each."""
+    values = [[float(row[column]) for row in rows if (row["method"], row["case"]) == (method, case)] for case in cases]
+    return np.array([np.mean(v) for v in values]), np.array([np.std(v) for v in values])
+
+
+def write_csv(path: Path, rows: list[dict]) -> None:
+    with open(path, "w", newline="") as file:
+        writer = csv.DictWriter(file, list(rows[0]))
+        writer.writeheader()
+        writer.writerows(rows)
