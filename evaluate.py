@@ -2,6 +2,7 @@
 
     python evaluate.py stiffness                          # every shipped checkpoint; about a minute a method
     python evaluate.py stiffness --checkpoints runs/a1-stiffness-rolt-seed0/policy.pt
+    python evaluate.py low_frequency                      # and high_frequency, attention: stairs and scandots that lie
     python evaluate.py dropout_ratio                      # why the dropout masks are stored
     python evaluate.py stiffness --methods rolt --episodes 8 --seconds 10 --out /tmp/quick
 
@@ -13,18 +14,24 @@ import os
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import torch
 
 from baselines import METHODS
 from checkpoint import CheckpointError, load_policy
 from cli import Parser, count, fail, num_cores, positive, seed, writable_folder
-from env import CONTROL_DT, LocomotionEnv
+from env import CONTROL_DT, EnvConfig, LocomotionEnv
 from faults import TASKS, healthy
+from noise import ScanNoise
 from paper import DAMAGE
-from plots import ratio_bands
-from ppo import Critic, PPOConfig, RolloutBuffer, collect, gaussian
-from protocol import report, run_cases, write_csv
+from plots import attention_maps, ratio_bands
+from ppo import Critic, PPOConfig, RolloutBuffer, collect, gaussian, to_tensors
+from protocol import report, report_curves, run_cases, write_csv
 from rolt import ROLT
+from scandots import HEIGHT_SCALE, NUM_PATCHES
+from terrain import Terrain, rise
+
+STAIRS_LEVEL = 2  # of the noise tests, ours
 
 
 def stiffness(args) -> None:
@@ -56,6 +63,58 @@ def damage(args) -> None:
     rows = run_cases(args, cases, speed=0.75)
     title = f"Damage test: {args.robot}, 0.75 m/s, {args.seconds:g} s"
     report(args, rows, list(cases), marked, "damage", title, paper=DAMAGE)
+
+
+def low_frequency(args) -> None:
+    """Section IV-B (i), figure "Low-frequency noise": stairs at 0.5 m/s, 4 of the 12 patches of the scan each offset as a
+    whole in a random direction, for the whole episode, by a growing distance. (The captions of the paper's two figures
+    are exchanged.)"""
+    scales = (0.0, 0.05, 0.1, 0.2, 0.4, 0.8)
+    noises = [ScanNoise(offset=scale) for scale in scales]
+    noise_test(args, scales, noises, "low_frequency", "Low-frequency noise", "offset of 4 patches of 12 [m]")
+
+
+def high_frequency(args) -> None:
+    """Section IV-B (ii), figure "High-frequency noise": as above, every point shifted in x, y and z by Gaussian noise."""
+    scales = (0.0, 0.05, 0.1, 0.2, 0.4, 0.8)
+    noises = [ScanNoise(sigma=scale) for scale in scales]
+    noise_test(args, scales, noises, "high_frequency", "High-frequency noise", "deviation of every point [m]")
+
+
+def noise_test(args, scales: tuple[float, ...], noises: list[ScanNoise], name: str, title: str, axis: str) -> None:
+    """Return and distance on stairs of STAIRS_LEVEL against the scale of the noise."""
+    stairs, rows = Terrain(("stairs",), (STAIRS_LEVEL,) * 3), []
+    for scale, noise in zip(scales, noises):
+        rows += run_cases(args, {f"{scale:g}": healthy()}, speed=0.5, terrain=stairs, noise=noise)
+    title = f"{title}: {args.robot}, stairs with steps of {100 * rise(STAIRS_LEVEL):.1f} cm, 0.5 m/s, {args.seconds:g} s"
+    report_curves(args, rows, scales, name, title, axis)
+
+
+@torch.no_grad()
+def attention(args) -> None:
+    """Figure "Elevation maps and attention maps": where the legs look when patches of the scan are missing (read zero).
+
+    One robot, 4 s into a walk over stairs of STAIRS_LEVEL. Shown is the attention of the leg tokens on the 12 patches in
+    the last layer, mean over legs and heads, made to add up to 1. Printed: the share of it on the missing patches, and
+    its entropy relative to an even gaze.
+    """
+    panels = {}
+    for title, noise in (("clean", ScanNoise()), ("4 patches missing", ScanNoise(missing_patches=4))):
+        for _, (policy, card) in args.policies.items():
+            config = EnvConfig(forward_speed=(0.5, 0.5), heading=(0.0, 0.0), push_speed=0.0, start_rows=1, climb=False)
+            stairs = Terrain(("stairs",), (STAIRS_LEVEL,) * 3)
+            env = LocomotionEnv(args.robot, 1, args.seed, 1, config=config, terrain=stairs, noise=noise)
+            observation = env.reset()
+            for _ in range(round(4 / CONTROL_DT)):
+                observation, _, terminated, _, _ = env.step(policy(to_tensors(observation, "cpu")).numpy())
+            weights = policy.attention(to_tensors(observation, "cpu"))[0, -1, :, :, -NUM_PATCHES:].mean((0, 1))
+            weights = (weights / weights.sum()).numpy()
+            missing = env.scan.missing[0].reshape(4, 4, 3, 4)[:, 0, :, 0].ravel()
+            entropy = -(weights * np.log(weights)).sum() / np.log(NUM_PATCHES)
+            print(f"{card['policy']:18}{title:20} on missing patches {weights[missing].sum():6.1%}, entropy {entropy:.2f}")
+            panels.setdefault(title, {"heights": observation.heights[0] / HEIGHT_SCALE})[card["policy"]] = weights
+    attention_maps(panels, args.out / "attention.png")
+    print(f"\nwritten: {args.out / 'attention.png'}")
 
 
 def short_name(joint: str) -> str:
@@ -110,6 +169,9 @@ def ratios(policy: ROLT, args, num_envs: int = 64) -> dict[str, torch.Tensor]:
 EXPERIMENTS = {
     "stiffness": (stiffness, "stiffness", tuple(METHODS)),
     "damage": (damage, "damage", tuple(METHODS)),
+    "low_frequency": (low_frequency, "terrain", ("mlp", "roll-drop", "rma", "no-pe-drop", "no-feature-drop", "rolt")),
+    "high_frequency": (high_frequency, "terrain", ("mlp", "roll-drop", "rma", "no-pe-drop", "no-feature-drop", "rolt")),
+    "attention": (attention, "terrain", ("no-pe-drop", "rolt")),
     "dropout_ratio": (dropout_ratio, "stiffness", ("rolt",)),
 }
 
@@ -131,9 +193,12 @@ def find_policies(args) -> dict[Path, tuple]:
         if not paths:
             fail("nothing to evaluate: name files with --checkpoints")
     try:
-        return {path: load_policy(path, args.robot) for path in paths}
+        policies = {path: load_policy(path, args.robot) for path in paths}
     except CheckpointError as error:
         fail(error)
+    for path, (_, card) in policies.items():
+        print(f"{card['policy']}: {path} ({card['steps'] / 1e6:.1f}M steps, seed {card['seed']})", flush=True)
+    return policies
 
 
 def main(argv: list[str] | None = None) -> None:

@@ -20,6 +20,7 @@ import numpy as np
 from mujoco.batch import Batch
 
 from robots import ROBOTS, Robot
+from terrain import TRAINING_MAP, Terrain
 
 
 @dataclass(frozen=True)
@@ -128,6 +129,7 @@ class Task:
     robots: tuple[str, ...]
     training: tuple[tuple[float, Fault], ...]  # (probability, fault), drawn anew at every reset
     unseen: tuple[Fault, ...]
+    terrain: Terrain | None = None  # flat ground
 
 
 TASKS = {
@@ -152,6 +154,8 @@ TASKS = {
             )
         ),
     ),
+    # Section IV-B: healthy, "on multiple terrains, including stairs, slopes and platforms"; the test is noise (noise.py).
+    "terrain": Task(robots=("a1",), training=((1.0, healthy()),), unseen=(), terrain=TRAINING_MAP),
 }
 
 
@@ -160,6 +164,7 @@ if __name__ == "__main__":
     for name, task in TASKS.items():
         print(f"\ntask {name} (robots: {', '.join(task.robots)})")
         print("  training:", ", ".join(f"{share:.0%} {fault}" for share, fault in task.training))
-        print("  unseen:  ", ", ".join(str(fault) for fault in task.unseen))
+        print("  unseen:  ", ", ".join(str(fault) for fault in task.unseen) or "noise on the scandots (noise.py)")
+        print("  ground:  ", ", ".join(dict.fromkeys(task.terrain.columns)) if task.terrain else "flat")
     for robot in ROBOTS.values():
         print(f"\njoints of the {robot.name}: {', '.join(robot.joints)}")

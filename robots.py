@@ -19,6 +19,8 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
+from terrain import Terrain
+
 PHYSICS_DT = 0.005  # s, legged_gym: 200 Hz physics, 4 substeps a control step of 50 Hz
 
 Vec3 = tuple[float, float, float]
@@ -70,8 +72,8 @@ class Robot:
         return [f"{leg}_{link.name}" for leg in self.legs for link in self.links]
 
 
-def build_model(robot: Robot) -> mujoco.MjModel:
-    """The robot on flat ground. Bodies and actuators in the order of `robot.joints`; keyframe 0 is the default pose.
+def build_model(robot: Robot, terrain: Terrain | None = None) -> mujoco.MjModel:
+    """The robot on flat ground or on a terrain. Bodies and actuators in the order of `robot.joints`; keyframe 0 is the default pose.
 
     Contacts are robot-ground only. Sensors `contact_<geom>` count the contacts of the trunk, of each link with a
     capsule, and of each foot.
@@ -86,6 +88,8 @@ def build_model(robot: Robot) -> mujoco.MjModel:
     spec.option.ls_iterations = 20
 
     _add_world(spec)
+    if terrain is not None:
+        terrain.build(spec)
     trunk = spec.worldbody.add_body(name="trunk", pos=[0, 0, robot.start_height])
     trunk.add_freejoint(name="root")
     trunk.add_light(

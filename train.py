@@ -39,7 +39,7 @@ from rewards import REWARDS
 from robots import ROBOTS
 
 # What a run may not change when it is resumed; of rma and roam, whose stages are shares of them, the steps neither.
-IDENTITY = ("robot", "task", "policy", "envs", "epochs", "minibatches", "seed", "processes")
+IDENTITY = ("robot", "task", "policy", "envs", "epochs", "minibatches", "seed", "processes", "init")
 STAGED = ("rma", "roam")
 
 
@@ -58,6 +58,7 @@ def parse_arguments(argv: list[str] | None = None):
     parser.add_argument("--threads", type=count, default=num_cores(), help="cores to use (default: all)")
     parser.add_argument("--out", type=Path, help="folder of the run (default: runs/ROBOT-TASK-POLICY-seedN)")
     parser.add_argument("--resume", action="store_true", help="go on from the checkpoint in that folder")
+    parser.add_argument("--init", metavar="FILE", help="start from the weights in a policy.pt or checkpoint.pt: flat, then stairs")
     parser.add_argument("--save-minutes", type=positive, default=3.0, help="time between two checkpoints")
     args = parser.parse_args(argv)
 
@@ -158,7 +159,8 @@ class Part:
         threads = args.threads if args.device == "cuda" else 1
         share, seeds = args.envs // args.processes, (args.seed, rank, number)
         self.number, self.actor = number, stage.actor
-        self.env = LocomotionEnv(args.robot, share, seeds, threads, stage.faults, extras=stage.extras)
+        terrain = TASKS[args.task].terrain
+        self.env = LocomotionEnv(args.robot, share, seeds, threads, stage.faults, extras=stage.extras, terrain=terrain)
         self.observation = self.env.reset(random_ages=True)
         self.critic = (Critic(self.observation, stage.actor.normalizer) if stage.critic is None else stage.critic).to(device)
         policy.requires_grad_(False)
@@ -187,6 +189,8 @@ def train(rank: int, args, sync: str | None) -> None:
     ends = [args.steps * sum(stage.share for stage in stages[: i + 1]) for i in range(len(stages) - 1)] + [args.steps]
     generator = torch.Generator(device).manual_seed(args.seed * 1_000_003 + rank)  # actions, masks, minibatches
     part = Part(0, stages[0], args, rank, policy, device)
+    if args.init and not args.resume:
+        checkpoint.start_from(args.init, args.robot, policy, part.critic)
     iteration, steps = 0, 0
 
     if args.resume:
@@ -208,7 +212,7 @@ def train(rank: int, args, sync: str | None) -> None:
         if args.processes > 1:
             dist.gather_object(mine, everyone if rank == 0 else None)
         if rank == 0:
-            content = {key: getattr(args, key) for key in ("robot", "task", "policy", "seed")} | {"steps": steps}
+            content = {key: getattr(args, key) for key in ("robot", "task", "policy", "seed", "init")} | {"steps": steps}
             content["weights"] = {name: tensor.cpu() for name, tensor in policy.state_dict().items()}
             checkpoint.save(content, args.out / "policy.pt")
             content |= {"critic": part.critic.state_dict(), "learner": part.learner.state_dict(), "processes": everyone}
@@ -255,7 +259,8 @@ def train(rank: int, args, sync: str | None) -> None:
         policy_file = args.out / "policy.pt"
         if steps < args.steps:
             print(f"\nstopped at {steps:,} steps and saved; the same command with --resume goes on")
-        print(f"\ntrained: {policy_file}\ntest it: python evaluate.py {args.task} --checkpoints {policy_file}")
+        test = "low_frequency" if args.task == "terrain" else args.task
+        print(f"\ntrained: {policy_file}\ntest it: python evaluate.py {test} --checkpoints {policy_file}")
     if args.processes > 1:
         dist.destroy_process_group()
 
@@ -311,6 +316,8 @@ def main(argv: list[str] | None = None) -> None:
             return train_all(sys.argv[1:] if argv is None else argv, args)
         saved = checkpoint.load_newest(args.out / "checkpoint.pt", say=True) if args.resume else {"identity": identity(args)}
         was = saved.get("identity", {})
+        if args.init:  # tried here, where it can be said in one line
+            checkpoint.start_from(args.init, args.robot, make_policy(args.policy, ROBOTS[args.robot], TASKS[args.task]))
     except checkpoint.CheckpointError as error:
         fail(error)
     differing = [f"{key} was {was.get(key)}, is {now}" for key, now in identity(args).items() if was.get(key) != now]
