@@ -140,6 +140,7 @@ def sum_over_processes(figures: dict[str, float], device) -> dict[str, float]:
 def summarise(infos: list[dict], buffer: RolloutBuffer, env: LocomotionEnv) -> tuple[dict, dict]:
     """What a rollout was like on this process's robots: figures to average over processes, and figures to add up."""
     means = {name: sum(i[name].mean() for i in infos) / len(infos) for name in ("speed", "commanded_speed")}
+    means["row"] = env.row.mean()  # of the terrain: how far the curriculum is
     for term in REWARDS:
         means[f"reward_{term.__name__}"] = sum(i["rewards"][term.__name__].mean() for i in infos) / len(infos)
     sums = {
