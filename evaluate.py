@@ -2,7 +2,8 @@
 
     python evaluate.py stiffness                          # every shipped checkpoint; about a minute a method
     python evaluate.py stiffness --checkpoints runs/a1-stiffness-rolt-seed0/policy.pt
-    python evaluate.py low_frequency                      # and high_frequency, attention: stairs and scandots that lie
+    python evaluate.py stairs                             # the paper's terrain, seeing and blind
+    python evaluate.py low_frequency                      # and high_frequency, attention: scandots that lie
     python evaluate.py dropout_ratio                      # why the dropout masks are stored
     python evaluate.py stiffness --methods rolt --episodes 8 --seconds 10 --out /tmp/quick
 
@@ -63,6 +64,19 @@ def damage(args) -> None:
     rows = run_cases(args, cases, speed=0.75)
     title = f"Damage test: {args.robot}, 0.75 m/s, {args.seconds:g} s"
     report(args, rows, list(cases), marked, "damage", title, paper=DAMAGE)
+
+
+def stairs(args) -> None:
+    """Not in the paper: does the policy climb, and with its eyes? Stairs of every level of the training at 0.5 m/s, with clean
+    scandots and blind (all of them read zero)."""
+    rows, cases = [], {}
+    for noise, suffix in ((ScanNoise(), ""), (ScanNoise(missing_patches=NUM_PATCHES), " blind")):
+        for level in dict.fromkeys(TASKS["terrain"].terrain.levels):
+            case = f"{100 * rise(level):.1f} cm{suffix}"
+            rows += run_cases(args, {case: healthy()}, speed=0.5, terrain=Terrain(("stairs",), (level,) * 3), noise=noise)
+            cases[case] = f"{100 * rise(level):.1f} cm{suffix and ' (blind)'}"
+    title = f"Stairs: {args.robot}, 0.5 m/s, {args.seconds:g} s"
+    report(args, rows, list(cases), list(cases.values()), "stairs", title)
 
 
 def low_frequency(args) -> None:
@@ -169,6 +183,7 @@ def ratios(policy: ROLT, args, num_envs: int = 64) -> dict[str, torch.Tensor]:
 EXPERIMENTS = {
     "stiffness": (stiffness, "stiffness", tuple(METHODS)),
     "damage": (damage, "damage", tuple(METHODS)),
+    "stairs": (stairs, "terrain", tuple(METHODS)),
     "low_frequency": (low_frequency, "terrain", ("mlp", "roll-drop", "rma", "no-pe-drop", "no-feature-drop", "rolt")),
     "high_frequency": (high_frequency, "terrain", ("mlp", "roll-drop", "rma", "no-pe-drop", "no-feature-drop", "rolt")),
     "attention": (attention, "terrain", ("no-pe-drop", "rolt")),
