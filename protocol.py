@@ -32,8 +32,8 @@ def run_episodes(
         episode_seconds=seconds + 1.0,  # nobody times out before we stop
         forward_speed=(speed, speed), lateral_speed=(0.0, 0.0), heading=(0.0, 0.0), push_speed=0.0,
     )  # fmt: skip
-    env = LocomotionEnv(robot, len(faults), seed, threads, config=config, extras=policy.extras)
-    env.pin_faults(faults)
+    env = LocomotionEnv(robot, len(faults), seed, threads, [(1.0, fault) for fault in faults], config, policy.extras)
+    env.pin_faults(faults)  # one each
     observation = env.reset()
     start, steps = env.position[:, 0].copy(), round(seconds / CONTROL_DT)
     distance, returns = np.zeros(len(faults)), np.zeros(len(faults))
