@@ -49,7 +49,7 @@ import mujoco
 import numpy as np
 from mujoco.batch import Batch
 
-from faults import Fault, healthy, write_fault
+from faults import Fault, healthy, props, write_fault
 from noise import NoisyScan, ScanNoise
 from rewards import FALL, total_reward
 from robots import PHYSICS_DT, ROBOTS, Robot, build_model
@@ -107,7 +107,8 @@ class Observation(NamedTuple):
 class LocomotionEnv:
     """N robots of one kind; robot i's episode ends, and is restarted by `step`, on its own.
 
-    faults: (probability, fault) pairs; each reset draws one. `pin_faults` fixes one a robot instead.
+    faults: (probability, fault) pairs; each reset draws one. `pin_faults` fixes one a robot instead. Boxes and skates
+        are there only if one of `faults` needs them.
     num_threads: of the simulator, 0 = one a core. Results do not depend on it.
     extras: which of privileged, past and situation the observation holds. None of them changes the simulation.
     terrain: None = flat ground. Robot i stays on column i modulo the number of columns.
@@ -139,7 +140,7 @@ class LocomotionEnv:
         self.episode_steps = round(config.episode_seconds / CONTROL_DT)
         self.rng = np.random.default_rng(seed)
         self.terrain, self.scan = terrain, NoisyScan(num_envs, terrain, noise, seed)
-        self.model = build_model(robot, terrain)
+        self.model = build_model(robot, terrain, **props([fault for _, fault in faults]))
         self.world = Batch(self.model, nsim=num_envs, nthread=num_threads, persistent=True)
         self._qpos, self._qvel, self._ctrl = (self.world.bind(name) for name in ("qpos", "qvel", "ctrl"))
         self._torque, self._contacts = self.world.bind("actuator_force"), self.world.bind("sensordata")
@@ -150,7 +151,8 @@ class LocomotionEnv:
         self._link_sensors = [i for i, name in enumerate(names) if name in robot.joints]
 
         self._default = np.array(robot.default_pose)  # (L, J)
-        self._limits = np.array([link.limits for link in robot.links])  # (J, 2)
+        self._joints = np.array([self.model.joint(name).id for name in robot.joints])  # (L*J,) ids, without wheels
+        self._angle_at, self._velocity_at = self.model.jnt_qposadr[self._joints], self.model.jnt_dofadr[self._joints]
         self.faults = [fault for _, fault in faults]
         self._fault_odds = np.array([probability for probability, _ in faults])
         self._pinned = False
@@ -266,14 +268,14 @@ class LocomotionEnv:
         if not self._pinned:
             self.fault_index[ids] = self.rng.choice(len(self.faults), size=n, p=self._fault_odds)
         pose = self._default * self.rng.uniform(*config.start_pose, size=(n, self.num_legs, self.num_joints))
-        pose = np.clip(pose, self._limits[:, 0], self._limits[:, 1]).reshape(n, -1)
         velocity = self.rng.uniform(-config.start_speed, config.start_speed, size=(n, 6))
         self._friction[ids, :, 0] = self.rng.uniform(*config.friction, size=(n, 1))
         for index in np.unique(self.fault_index[ids]):
             chosen = self.fault_index[ids] == index
             write_fault(self.faults[index], self.robot, self.world, ids[chosen])
-        locked = self.world.bind("eq_active")[ids] > 0
-        self._qpos[ids, 7:] = np.where(locked, self._default.reshape(-1), pose)
+        locked, limits = self.world.bind("eq_active")[ids] > 0, self.world.expand("jnt_range")[ids][:, self._joints]
+        pose = np.clip(pose.reshape(n, -1), limits[:, :, 0], limits[:, :, 1])
+        self._qpos[ids[:, None], self._angle_at] = np.where(locked, self._default.reshape(-1), pose)
         self._qvel[ids, :6] = velocity
         if self.terrain:
             self.start[ids] = self.terrain.start(self.row[ids], self.column[ids])
@@ -361,8 +363,8 @@ class LocomotionEnv:
         self.linear_velocity = np.einsum("nij,nj->ni", rotation, self._qvel[:, :3])
         self.angular_velocity = self._qvel[:, 3:6].copy()
         self.gravity = -rotation[:, :, 2]
-        self.joint_error = self._qpos[:, 7:].reshape(shape) - self._default
-        self.joint_velocity = self._qvel[:, 6:].reshape(shape).copy()
+        self.joint_error = self._qpos[:, self._angle_at].reshape(shape) - self._default
+        self.joint_velocity = self._qvel[:, self._velocity_at].reshape(shape)
         self.torque = self._torque.reshape(shape)
         self.link_contact = self._contacts[:, self._link_sensors] > 0
 

@@ -4,6 +4,7 @@
     python evaluate.py stiffness --checkpoints runs/a1-stiffness-rolt-seed0/policy.pt
     python evaluate.py stairs                             # the paper's terrain, seeing and blind
     python evaluate.py low_frequency                      # and high_frequency, attention: scandots that lie
+    python evaluate.py real_world                         # a Go1 with a weak leg, a box in tow, skates
     python evaluate.py dropout_ratio                      # why the dropout masks are stored
     python evaluate.py stiffness --methods rolt --episodes 8 --seconds 10 --out /tmp/quick
 
@@ -22,9 +23,10 @@ from baselines import METHODS
 from checkpoint import CheckpointError, load_policy
 from cli import Parser, count, fail, num_cores, positive, seed, writable_folder
 from env import CONTROL_DT, EnvConfig, LocomotionEnv
-from faults import TASKS, healthy
+from faults import REAL_WORLD, TASKS, healthy
 from noise import ScanNoise
 from paper import DAMAGE
+from paper import REAL_WORLD as REAL_WORLD_PAPER
 from plots import attention_maps, ratio_bands
 from ppo import Critic, PPOConfig, RolloutBuffer, collect, gaussian, to_tensors
 from protocol import report, report_curves, run_cases, write_csv
@@ -131,6 +133,29 @@ def attention(args) -> None:
     print(f"\nwritten: {args.out / 'attention.png'}")
 
 
+def real_world(args) -> None:
+    """Section IV-D, table "Real-world Experiments", rebuilt in simulation: a Go1 trained on the stiffness task, 10 s.
+
+        weaken   the front left leg's motors at half their strength, the hind right calf tied so that it cannot open
+                 beyond its default angle
+        box      the hind right foot drags a box of 4 kg (20 N) on a tether of 0.8 m
+        skates   both front feet are wheels
+
+    These are not the paper's robots, boxes and skates. It measured a physical Go1, with a real motor's delay and heat, a
+    floor that is not flat, sensors that err, and a velocity estimated, not known; here all that is ideal, and how weak,
+    how heavy, how smooth is ours, because the paper says none of it (faults.py, robots.py give numbers and reasons). Nor
+    does it say the command: 0.75 m/s, as in its other tests. So its figures, shown beside, are no target that a
+    simulation could confirm: what can be compared is whether a method walks on or falls, and how methods rank.
+    """
+    rows = []
+    for case, fault in REAL_WORLD.items():  # one by one: only those who need a box or wheels have them
+        print(f"\n{case}: {fault}")
+        rows += run_cases(args, {case: fault}, speed=0.75)
+    title = f"Real-world test, simulated: {args.robot}, 0.75 m/s, {args.seconds:g} s"
+    report(args, rows, list(REAL_WORLD), list(REAL_WORLD), "real_world", title, paper=REAL_WORLD_PAPER)
+    print("(paper): a physical Go1, 10 s")
+
+
 def short_name(joint: str) -> str:
     """FL_calf -> FLC"""
     leg, link = joint.split("_")
@@ -187,8 +212,10 @@ EXPERIMENTS = {
     "low_frequency": (low_frequency, "terrain", ("mlp", "roll-drop", "rma", "no-pe-drop", "no-feature-drop", "rolt")),
     "high_frequency": (high_frequency, "terrain", ("mlp", "roll-drop", "rma", "no-pe-drop", "no-feature-drop", "rolt")),
     "attention": (attention, "terrain", ("no-pe-drop", "rolt")),
+    "real_world": (real_world, "stiffness", tuple(METHODS)),
     "dropout_ratio": (dropout_ratio, "stiffness", ("rolt",)),
 }
+DEFAULTS = {"real_world": {"robot": "go1", "seconds": 10.0}}  # where they are not the task's first robot and 20 s
 
 
 def find_policies(args) -> dict[Path, tuple]:
@@ -223,14 +250,16 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--methods", nargs="+", choices=METHODS, help="which shipped checkpoints (default: all)")
     parser.add_argument("--checkpoints", nargs="+", type=Path, metavar="FILE", help="policy files, instead of the shipped")
     parser.add_argument("--episodes", type=count, default=32, help="a case (default 32)")
-    parser.add_argument("--seconds", type=positive, default=20.0, help="of an episode (default 20, the paper's)")
+    parser.add_argument("--seconds", type=positive, help="of an episode (default: the paper's 20; real_world 10)")
     parser.add_argument("--seed", type=seed, default=0, help="of the starts")
     parser.add_argument("--threads", type=count, default=num_cores(), help="cores to use (default: all)")
     parser.add_argument("--out", type=Path, default=Path("results"), help="folder of the CSV file and the picture")
     args = parser.parse_args(argv)
     function, task, suitable = EXPERIMENTS[args.experiment]
     robots = TASKS[task].robots
-    args.robot = args.robot or robots[0]
+    defaults = DEFAULTS.get(args.experiment, {})
+    args.robot = args.robot or defaults.get("robot", robots[0])
+    args.seconds = args.seconds or defaults.get("seconds", 20.0)
     if args.robot not in robots:
         fail(f"the test {args.experiment} is for {', '.join(robots)}, not for {args.robot}")
     if args.seconds < CONTROL_DT:

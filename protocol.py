@@ -35,8 +35,9 @@ def run_episodes(
         forward_speed=(speed, speed), lateral_speed=(0.0, 0.0), heading=(0.0, 0.0), push_speed=0.0,
         start_rows=1, climb=False,
     )  # fmt: skip
-    env = LocomotionEnv(robot, len(faults), seed, threads, config=config, extras=policy.extras, **env_options)
-    env.pin_faults(faults)
+    situations = [(1.0, fault) for fault in faults]
+    env = LocomotionEnv(robot, len(faults), seed, threads, situations, config, policy.extras, **env_options)
+    env.pin_faults(faults)  # one each
     observation = env.reset()
     start, steps = env.position[:, 0].copy(), round(seconds / CONTROL_DT)
     distance, returns = np.zeros(len(faults)), np.zeros(len(faults))
