@@ -21,7 +21,7 @@ from normalizer import Normalizer
 from robots import ROBOTS
 
 FORMAT = 1  # raise it when files of before can no longer be read
-CARD = ("robot", "task", "policy", "steps", "seed")  # what a policy file says about itself
+CARD = {"robot": "a1", "task": "stiffness", "policy": "rolt", "steps": 0, "seed": 0}  # what a policy file says
 
 
 class CheckpointError(ValueError):
@@ -72,20 +72,50 @@ def load_newest(path: Path, say: bool = False) -> dict:
 
 
 def load(path: str | Path) -> dict:
-    """The dictionary in the file. CheckpointError if it is missing, damaged or of another format."""
-    path = Path(path)
-    if not path.is_file():
+    """The dictionary in the file. CheckpointError if it is missing, damaged, of another format or holds a NaN."""
+    if not os.path.isfile(path):
         raise CheckpointError(f"there is no checkpoint {path}")
     try:
         with zipfile.ZipFile(path) as archive:  # what torch.save writes; torch.load does not look at its checksums
             if altered := archive.testzip():
                 raise ValueError(f"the checksum of {altered} is wrong")
         content = torch.load(path, map_location="cpu", weights_only=True)
+        numbers = [(name, x) for name, x in tensors(content) if x.is_floating_point()]
+        bad = [name for name, x in numbers if not torch.isfinite(x).all()]
     except Exception as error:  # whatever damaged bytes provoke in zip, pickle or torch
         raise CheckpointError(f"{path} is not a whole checkpoint ({type(error).__name__}): copy or train it again") from error
-    if not isinstance(content, dict) or content.get("format") != FORMAT:
+    if not isinstance(content, dict) or type(content.get("format")) is not int or content["format"] != FORMAT:
         raise CheckpointError(f"{path} is not a checkpoint of this version (format {FORMAT}): train it again")
+    if bad:
+        raise CheckpointError(f"{path} is of no use: {bad[0]} is not finite")
     return content
+
+
+def tensors(value, name: str = ""):
+    """(name, tensor) of all that is in nested dictionaries and lists, e.g. ("weights.decoder.bias", ...)."""
+    if isinstance(value, torch.Tensor):
+        yield name, value
+    elif isinstance(value, dict | list | tuple):
+        for key, item in value.items() if isinstance(value, dict) else enumerate(value):
+            yield from tensors(item, f"{name}.{key}".lstrip("."))
+
+
+def misfit(saved, own, name: str) -> str | None:
+    """What keeps `saved` from taking the place of `own`: another key, type, length, shape or dtype. None if nothing does."""
+    if isinstance(own, dict) and isinstance(saved, dict):
+        if odd := [str(key) for key in own if key not in saved] + [str(key) for key in saved if key not in own]:
+            return f"{name}.{odd[0]} is {'missing' if odd[0] in map(str, own) else 'unknown'}"
+        pairs = [(saved[key], own[key], f"{name}.{key}") for key in own]
+    elif isinstance(own, list) and isinstance(saved, list) and len(own) == len(saved):
+        pairs = [(a, b, f"{name}.{i}") for i, (a, b) in enumerate(zip(saved, own))]
+    elif isinstance(own, torch.Tensor) and isinstance(saved, torch.Tensor):
+        forms = [(tuple(x.shape), x.dtype, x.layout) for x in (saved, own)]
+        return None if forms[0] == forms[1] else f"{name} is {forms[0][0]} {forms[0][1]}, not {forms[1][0]} {forms[1][1]}"
+    elif type(saved) is type(own) and not isinstance(own, list):
+        return None
+    else:
+        return f"{name} is not what it should be"
+    return next((found for pair in pairs if (found := misfit(*pair))), None)
 
 
 def load_policy(path: str | Path, robot: str | None = None) -> tuple[torch.nn.Module, dict]:
@@ -98,20 +128,21 @@ def load_policy(path: str | Path, robot: str | None = None) -> tuple[torch.nn.Mo
     if missing:
         raise CheckpointError(f"{path} holds no policy: {', '.join(missing)} is missing")
     card = {key: content[key] for key in CARD}
+    if why := misfit(card, CARD, "the file's card"):
+        raise CheckpointError(f"{path} holds no policy: {why}")
     if card["robot"] not in ROBOTS or card["policy"] not in METHODS or card["task"] not in TASKS:
         what = f"{card['robot']}, {card['task']}, {card['policy']}"
         raise CheckpointError(f"{path} is of a robot, task or policy unknown here: {what}")
     if robot is not None and card["robot"] != robot:
         raise CheckpointError(f"{path} was trained on the {card['robot']}, not on the {robot}")
     policy = make_policy(card["policy"], ROBOTS[card["robot"]], TASKS[card["task"]])
-    try:
-        policy.load_state_dict(content["weights"])
-    except (RuntimeError, TypeError, AttributeError) as error:
-        raise CheckpointError(f"the weights in {path} do not fit the policy {card['policy']}: train it again") from error
+    if why := misfit(content["weights"], policy.state_dict(), "weights"):
+        raise CheckpointError(f"the weights in {path} do not fit the policy {card['policy']} ({why}): train it again")
+    policy.load_state_dict(content["weights"])
     return policy.eval(), card
 
 
-def start_from(path: str | Path, robot: str, policy: torch.nn.Module, critic: torch.nn.Module | None = None) -> None:
+def start_from(path: str | Path, robot: str, policy: torch.nn.Module, critic: torch.nn.Module) -> None:
     """Puts the weights in the file into a fresh policy and, if it is a checkpoint.pt, into a fresh critic.
 
     The file may be of another method whose weights include all of the policy's (ROLT's fit the ablations of its dropout).
@@ -125,7 +156,7 @@ def start_from(path: str | Path, robot: str, policy: torch.nn.Module, critic: to
         missing, _ = policy.load_state_dict(content["weights"], strict=False)
         if missing:
             raise KeyError(missing[0])
-        if critic is not None and content.get("critic"):  # a finished RMA or ROAM has none
+        if content.get("critic"):  # a finished RMA or ROAM has none
             critic.load_state_dict(content["critic"])
     except (RuntimeError, TypeError, AttributeError, KeyError) as error:
         raise CheckpointError(f"the weights in {path} do not fit this policy: start from one of its own") from error

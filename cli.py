@@ -3,6 +3,7 @@
 import argparse
 import os
 import sys
+import tempfile
 from pathlib import Path
 from typing import NoReturn
 
@@ -22,14 +23,14 @@ class Parser(argparse.ArgumentParser):
     """argparse, but a wrong value ends in one line without the usage in front of it."""
 
     def __init__(self, doc: str):
-        super().__init__(description=doc, formatter_class=argparse.RawDescriptionHelpFormatter)
+        super().__init__(description=doc, formatter_class=argparse.RawDescriptionHelpFormatter, allow_abbrev=False)
 
     def error(self, message: str) -> NoReturn:
         fail(f"{message} (--help lists what there is)")
 
 
-def count(text: str) -> int:
-    """A whole number of at least 1; 6e6 and 6_000_000 are fine."""
+def count(text: str, most: int = 10**12) -> int:
+    """A whole number from 1 to `most`; 6e6 and 6_000_000 are fine."""
     try:
         value = float(text)
         whole = int(value)
@@ -37,7 +38,14 @@ def count(text: str) -> int:
         raise argparse.ArgumentTypeError(f"{text!r} is not a number") from None
     if whole != value or whole < 1:
         raise argparse.ArgumentTypeError(f"{text!r} is not a whole number of at least 1")
+    if whole > most:
+        raise argparse.ArgumentTypeError(f"{text!r} is too much: at most {most}")
     return whole
+
+
+def threads(text: str) -> int:
+    """A whole number from 1 to twice the cores there are; up to 8 anywhere."""
+    return count(text, max(8, 2 * num_cores()))
 
 
 def seed(text: str) -> int:
@@ -47,14 +55,14 @@ def seed(text: str) -> int:
     return int(text)
 
 
-def positive(text: str) -> float:
-    """A finite number above 0."""
+def positive(text: str, most: float = 1e6) -> float:
+    """A number above 0, up to `most`."""
     try:
         value = float(text)
     except ValueError:
         raise argparse.ArgumentTypeError(f"{text!r} is not a number") from None
-    if not 0 < value < float("inf"):
-        raise argparse.ArgumentTypeError(f"{text!r} is not a number above 0")
+    if not 0 < value <= most:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a number above 0, up to {most:g}")
     return value
 
 
@@ -65,14 +73,16 @@ def num_cores() -> int:
 
 def lock_folder(path: Path):
     """Keeps other processes from training into the folder, until the returned file is closed; ends the program if one does
-    so already. (Where the system has no such locks, nothing happens.)"""
+    so already. (Where there are no such locks, nothing happens.)"""
     if fcntl is None:
         return None
     file = open(path / ".lock", "w")
     try:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError:
+    except BlockingIOError:
         fail(f"another process is training into {path}: wait for it, or choose another --out or --seed")
+    except OSError:  # a file system without locks
+        pass
     return file
 
 
@@ -80,9 +90,7 @@ def writable_folder(path: Path) -> Path:
     """Makes the folder if need be; ends the program if nothing can be written there."""
     try:
         path.mkdir(parents=True, exist_ok=True)
-        probe = path / f".writable-{os.getpid()}"
-        probe.touch()
-        probe.unlink()
+        tempfile.TemporaryFile(dir=path).close()
     except OSError as error:
         fail(f"cannot write to the folder {path}: {error.strerror}; choose another with --out")
     return path

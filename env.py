@@ -63,6 +63,7 @@ HISTORY = 10  # steps (paper, section III-A)
 LONG_HISTORY = 50  # steps that RMA's adaptation reads (Kumar et al. 2021)
 EXTRAS = ("privileged", "past", "situation")
 MAX_ACTION = 10.0  # ours: 2.5 rad from the default pose reaches every joint limit
+MAX_SPEED = 1000.0  # m/s and rad/s, ours: flailing at the motors' limits reaches 100; beyond is a simulation that ran away
 MAX_TILT = np.cos(np.deg2rad(60))  # ours: past 60 degrees no robot here gets up again; legged_gym waits for contact
 SAVED_ARRAYS = (
     "action", "last_action", "history", "command", "heading", "air_time", "age", "command_age", "episode_return", "fault_index",
@@ -167,7 +168,7 @@ class LocomotionEnv:
         self.age = np.zeros(num_envs, dtype=int)  # (N,) steps since reset
         self.command_age = np.zeros(num_envs, dtype=int)  # (N,) steps since the command was drawn
         self.episode_return = np.zeros(num_envs)
-        self.divergences = 0  # simulations that MuJoCo gave up, in total
+        self.divergences = 0  # simulations that were given up, in total
         self.row = np.zeros(num_envs, dtype=int)  # (N,) of the terrain, on which the episode started
         self.column = np.arange(num_envs) % len(terrain.columns if terrain else "1")
         self.start = np.zeros((num_envs, 2))  # (N, 2) m
@@ -211,7 +212,7 @@ class LocomotionEnv:
         """
         action = np.asarray(action, dtype=np.float64).reshape(self.action.shape)
         if not np.isfinite(action).all():
-            raise ValueError("an action is not finite: the policy that made it has diverged")
+            raise FloatingPointError("an action is not finite: the policy that made it has diverged")
         self.last_action, self.action = self.action, np.clip(action, -MAX_ACTION, MAX_ACTION)
         self._ctrl[:] = self._target().reshape(self.num_envs, -1)
         self.world.step(nstep=SUBSTEPS, stage=mujoco.mjtStage.mjSTAGE_VEL)
@@ -320,10 +321,12 @@ class LocomotionEnv:
             self._qvel[due, :2] = self.rng.uniform(-speed, speed, size=(int(due.sum()), 2))
 
     def _diverged(self) -> np.ndarray:
-        """(N,) bool, simulations that MuJoCo reset by itself because their numbers ran away."""
-        warning = mujoco.mjtWarning
-        bad = [int(w) for w in (warning.mjWARN_BADQPOS, warning.mjWARN_BADQVEL, warning.mjWARN_BADQACC)]
-        diverged = (self.world.warning[:, bad, 1] > 0).any(axis=1)
+        """(N,) bool, simulations that MuJoCo warns about (it has reset most of them) or whose state ran away; afterwards all
+        states are finite."""
+        wild = ~((np.abs(self._qvel).max(axis=1) < MAX_SPEED) & np.isfinite(self._qpos).all(axis=1))  # NaN is not < either
+        diverged = wild | (self.world.warning[:, :, 1] > 0).any(axis=1)
+        if wild.any():
+            self.world.reset(np.flatnonzero(wild), keyframe=0, stage=mujoco.mjtStage.mjSTAGE_VEL)
         self.divergences += int(diverged.sum())
         return diverged
 

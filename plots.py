@@ -12,9 +12,14 @@ import numpy as np  # noqa: E402
 
 def learning_curve(progress: Path, picture: Path) -> None:
     """Draws the run's progress.csv: return, speed against the command, episode length, sigma and KL over steps."""
+    rows = []
     with open(progress, newline="") as file:
-        rows = [row for row in csv.DictReader(file) if None not in row and None not in row.values()]  # the whole ones
-    column = {name: np.array([float(row[name]) for row in rows]) for name in rows[0]}
+        for row in csv.DictReader(file):
+            try:
+                rows.append({name: float(value) for name, value in row.items()})
+            except (TypeError, ValueError):  # a torn row
+                pass
+    column = {name: np.array([row[name] for row in rows]) for name in rows[0]}
     steps = column["steps"] / 1e6
     figure, axes = plt.subplots(2, 2, figsize=(9, 5.5), sharex=True, layout="constrained")
     panels = {

@@ -13,34 +13,41 @@ On a CPU every core gets a process of its own with its share of the robots; the 
 (torch.distributed). Two processes of one thread run nearly twice as fast as one process of two threads.
 """
 
-import csv
+# ruff: noqa: E402
+import signal
+
+if __name__ == "__main__":  # until the training has begun there is nothing to save: Ctrl-C ends it without a traceback
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+
 import math
 import os
-import signal
 import sys
-import tempfile
 import time
-from collections import deque
+from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 
+import numpy as np
 import torch
 import torch.distributed as dist
-import torch.multiprocessing as mp
 from torch import nn
 
 import checkpoint
 from baselines import METHODS, Stage, make_policy, training_stages
-from cli import Parser, count, fail, lock_folder, num_cores, positive, seed, writable_folder
-from env import CONTROL_DT, LocomotionEnv
+from checkpoint import CheckpointError
+from cli import Parser, count, fail, lock_folder, num_cores, positive, seed, threads, writable_folder
+from env import CONTROL_DT, EnvConfig, LocomotionEnv
 from faults import TASKS
 from plots import learning_curve
-from ppo import Critic, Learner, PPOConfig, RolloutBuffer, all_reduce, collect, to_tensors
+from ppo import Critic, Learner, PPOConfig, RolloutBuffer, all_reduce, collect
+from processes import orphaned, run
 from rewards import REWARDS
 from robots import ROBOTS
 
 # What a run may not change when it is resumed; of rma and roam, whose stages are shares of them, the steps neither.
-IDENTITY = ("robot", "task", "policy", "envs", "epochs", "minibatches", "seed", "processes", "init")
+IDENTITY = ("robot", "task", "policy", "envs", "epochs", "minibatches", "seed", "processes", "device", "init")
 STAGED = ("rma", "roam")
+EPISODES = ("episodes", "returns", "lengths", "falls")  # figures of finished episodes, added up over a rollout
 
 
 def parse_arguments(argv: list[str] | None = None):
@@ -48,14 +55,14 @@ def parse_arguments(argv: list[str] | None = None):
     parser.add_argument("--robot", choices=ROBOTS, default="a1")
     parser.add_argument("--task", choices=TASKS, help="which faults are trained, see faults.py (default: the robot's first)")
     parser.add_argument("--policy", choices=(*METHODS, "all"), default="rolt")
-    parser.add_argument("--envs", type=count, default=512, help="robots simulated at once")
+    parser.add_argument("--envs", type=partial(count, most=2**16), default=512, help="robots simulated at once")
     parser.add_argument("--steps", type=count, default=6_000_000, help="env steps in total, over all robots")
-    parser.add_argument("--epochs", type=count, default=PPOConfig.epochs, help="of PPO, over each rollout")
+    parser.add_argument("--epochs", type=partial(count, most=1000), default=PPOConfig.epochs, help="over each rollout")
     parser.add_argument("--minibatches", type=count, default=PPOConfig.minibatches, help="an epoch")
     parser.add_argument("--paper", action="store_true", help="4096 robots, 400M steps, 5 epochs of 4 minibatches")
     parser.add_argument("--seed", type=seed, default=0)
     parser.add_argument("--device", choices=("auto", "cpu", "cuda"), default="auto", help="auto: cuda if there is one")
-    parser.add_argument("--threads", type=count, default=num_cores(), help="cores to use (default: all)")
+    parser.add_argument("--threads", type=threads, default=num_cores(), help="cores to use (default: all)")
     parser.add_argument("--out", type=Path, help="folder of the run (default: runs/ROBOT-TASK-POLICY-seedN)")
     parser.add_argument("--resume", action="store_true", help="go on from the checkpoint in that folder")
     parser.add_argument("--init", metavar="FILE", help="start from the weights in a policy.pt or checkpoint.pt: flat, then stairs")
@@ -81,50 +88,55 @@ def parse_arguments(argv: list[str] | None = None):
             fail("every policy has a folder of its own: leave --out away with --policy all")
         return args
     args.out = args.out or Path("runs") / f"{args.robot}-{args.task}-{args.policy}-seed{args.seed}"
-    saved = args.out / "checkpoint.pt"
-    if args.resume and not saved.exists():
+    saved = any(os.path.exists(args.out / name) for name in ("checkpoint.pt", "checkpoint.pt.previous"))
+    if args.resume and not saved:
         fail(f"there is nothing to resume in {args.out}; leave --resume away to start there")
-    if saved.exists() and not args.resume:
+    if saved and not args.resume:
         fail(f"{args.out} holds a run already; go on with --resume, or choose another --out or --seed")
     writable_folder(args.out)
     return args
 
 
 class Progress:
-    """One CSV row an iteration, the picture of it, and the live line."""
+    """One CSV row an iteration, and the live line."""
 
     def __init__(self, args, iteration: int, steps: int):
-        self.args, self.path, self.start, self.first = args, args.out / "progress.csv", time.time(), steps
-        self.recent = deque(maxlen=20)  # iterations, for figures of episodes, which end now and then
-        rows = []
-        if iteration and self.path.exists():  # drop what was logged after the checkpoint that we go on from
-            with open(self.path, newline="") as file:
-                rows = list(csv.reader(file))[: iteration + 1]
-        with open(self.path, "w", newline="") as file:
-            csv.writer(file).writerows(rows)
+        self.path, self.resumed, self.total = args.out / "progress.csv", iteration, args.steps
+        self.first, self.start, self.begun = steps, time.monotonic(), False
 
-    def log(self, row: dict, sums: dict[str, float]) -> None:
-        """Writes the row and prints the line (every tenth one if the output is not a terminal)."""
-        self.recent.append(sums)
-        number, returns, lengths, falls = (
-            sum(sums[name] for sums in self.recent) for name in ("episodes", "returns", "lengths", "falls")
-        )
+    def _begin(self, header: str) -> None:
+        """Keeps the rows up to the checkpoint that we go on from; whole or not at all, as a run may be killed here, too."""
+        rows = self.path.read_text(errors="replace").splitlines() if self.resumed and self.path.exists() else []
+        whole = [row.split(",") for row in rows[1:] if row.count(",") == header.count(",")]
+        kept = [",".join(row) for row in whole if row[0].isdecimal() and int(row[0]) <= self.resumed]
+        if rows and rows[0] != header:  # of another version of this program, or damaged
+            self.path.replace(self.path.with_name("progress.previous.csv"))
+            kept = []
+        temporary = self.path.with_name("progress.csv.tmp")
+        temporary.write_text("\n".join([header, *kept, ""]))
+        temporary.replace(self.path)
+        self.begun = True
+
+    def log(self, row: dict, episodes: np.ndarray) -> None:
+        """Writes the row and prints the line (every tenth one if the output is not a terminal). episodes: sums of `EPISODES`
+        over the last iterations."""
+        number, returns, lengths, falls = episodes.tolist()
         recent = [x / number if number else math.nan for x in (returns, lengths * CONTROL_DT, falls)]
         row |= dict(zip(("episode_return", "episode_seconds", "falls"), recent))
-        with open(self.path, "a", newline="") as file:
-            writer = csv.DictWriter(file, list(row))
-            if file.tell() == 0:
-                writer.writeheader()
-            writer.writerow({name: f"{value:.6g}" if isinstance(value, float) else value for name, value in row.items()})
+        if not self.begun:
+            self._begin(",".join(row))
+        with open(self.path, "a") as file:
+            file.write(",".join(f"{x:.6g}" if isinstance(x, float) else str(x) for x in row.values()) + "\n")
 
-        steps, total = row["steps"], self.args.steps
-        rate = (steps - self.first) / (time.time() - self.start)
+        steps, total = row["steps"], self.total
+        rate = (steps - self.first) / (time.monotonic() - self.start)
         bar = "#" * int(20 * min(1, steps / total))
         line = (
             f"[{bar:.<20}] {steps / 1e6:.2f}/{total / 1e6:.2f}M {rate:,.0f}/s"
             f" {max(0, total - steps) / rate / 60:.0f} min left"
             f" | return {recent[0]:.1f} speed {row['speed']:.2f} of {row['commanded_speed']:.2f} m/s"
             f" episode {recent[1]:.1f} s falls {recent[2]:.0%} sigma {row['sigma']:.2f} KL {row['kl']:.3f}"
+            + f" diverged {row['divergences']}" * (row["divergences"] > 0)
         )
         if sys.stdout.isatty():
             print(f"\r{line}\033[K", end="", flush=True)
@@ -173,8 +185,9 @@ class Part:
         self.learner = stage.learner(stage.actor, self.critic, config)
 
 
-def train(rank: int, args, sync: str | None) -> None:
-    """The training loop of one process."""
+def train(rank: int, args, sync: str | None, stop: list) -> None:
+    """The training loop of one process. It saves and ends after the iteration in which `stop` is no longer empty."""
+    lock = lock_folder(args.out) if rank == 0 else None  # noqa: F841 (held until the end)
     device = torch.device("cpu")
     if args.device == "cuda":
         device = torch.device("cuda", int(os.environ.get("LOCAL_RANK", 0)))
@@ -193,42 +206,62 @@ def train(rank: int, args, sync: str | None) -> None:
     if args.init and not args.resume:
         checkpoint.start_from(args.init, args.robot, policy, part.critic)
     iteration, steps = 0, 0
+    recent = np.zeros((20, len(EPISODES)))  # of the last iterations: episodes end now and then
+
+    def state() -> dict:
+        """What checkpoint.pt holds: all that the next iteration depends on (of this process, for all of them)."""
+        content = {key: getattr(args, key) for key in ("robot", "task", "policy", "seed", "init")} | {"steps": steps}
+        content["weights"] = {name: tensor.cpu() for name, tensor in policy.state_dict().items()}
+        content |= {"critic": part.critic.state_dict(), "learner": part.learner.state_dict()}
+        content |= {"iteration": iteration, "stage": part.number, "recent": torch.from_numpy(recent)}
+        mine = {"env": to_plain(part.env.state_dict()), "generator": generator.get_state()}
+        content |= {"processes": [mine] * args.processes, "torch": torch.get_rng_state()}
+        return content | {"identity": identity(args)}
 
     if args.resume:
         saved = checkpoint.load_newest(args.out / "checkpoint.pt")
-        iteration, steps = saved["iteration"], saved["steps"]
-        if saved["stage"]:
-            part = Part(saved["stage"], stages[saved["stage"]], args, rank, policy, device)
+        place = [saved.get(key) for key in ("iteration", "steps", "stage")]
+        if any(type(n) is not int or n < 0 for n in place) or place[2] >= len(stages):
+            raise CheckpointError(f"the checkpoint in {args.out} does not say where it was made")
+        if place[2]:
+            part = Part(place[2], stages[place[2]], args, rank, policy, device)
+        part.learner.optimizer.step()  # with gradients that are still 0: moves nothing, but makes the state that is compared
+        own = state()
+        saved = {"recent": own["recent"], "torch": own["torch"]} | saved  # files of before had neither
+        for key in own.keys() - {"identity"}:
+            if why := checkpoint.misfit(saved.get(key), own[key], key):
+                raise CheckpointError(f"the checkpoint in {args.out} does not fit this run: {why}")
+        (iteration, steps, _), recent, mine = place, saved["recent"].numpy(), saved["processes"][rank]
         policy.load_state_dict(saved["weights"])
         part.critic.load_state_dict(saved["critic"])
         part.learner.load_state_dict(saved["learner"])
-        part.env.load_state_dict(from_plain(saved["processes"][rank]["env"]))
-        generator.set_state(saved["processes"][rank]["generator"])
+        try:
+            part.env.load_state_dict(from_plain(mine["env"]))
+            generator.set_state(mine["generator"])
+            torch.set_rng_state(saved["torch"])
+        except (ValueError, IndexError, OverflowError, RuntimeError) as error:  # no random state, no fault of this task
+            raise CheckpointError(f"the checkpoint in {args.out} does not fit this run: {error}") from error
         part.observation = part.env.observe()
 
     def save() -> None:
         """Process 0 writes the files; the others tell it their part."""
-        mine = {"env": to_plain(part.env.state_dict()), "generator": generator.get_state()}
-        everyone = [mine] * args.processes
+        content = state()
         if args.processes > 1:
-            dist.gather_object(mine, everyone if rank == 0 else None)
+            dist.gather_object(content["processes"][rank], content["processes"] if rank == 0 else None)
         if rank == 0:
-            content = {key: getattr(args, key) for key in ("robot", "task", "policy", "seed", "init")} | {"steps": steps}
-            content["weights"] = {name: tensor.cpu() for name, tensor in policy.state_dict().items()}
-            checkpoint.save(content, args.out / "policy.pt")
-            content |= {"critic": part.critic.state_dict(), "learner": part.learner.state_dict(), "processes": everyone}
-            content |= {"iteration": iteration, "stage": part.number, "identity": identity(args)}
+            with open(progress.path) as file:
+                os.fsync(file.fileno())  # no checkpoint without its rows
+            checkpoint.save({key: content[key] for key in (*checkpoint.CARD, "init", "weights")}, args.out / "policy.pt")
             checkpoint.save_next(content, args.out / "checkpoint.pt")
-            learning_curve(args.out / "progress.csv", args.out / "progress.png")
+            learning_curve(progress.path, args.out / "progress.png")
 
-    stop = []  # Ctrl-C and SIGTERM end the run after the iteration that they interrupt
-    handlers = {n: signal.signal(n, lambda *_: stop.append(True)) for n in (signal.SIGINT, signal.SIGTERM)}
-    progress = Progress(args, iteration, steps) if rank == 0 else None
-    saved_at = time.time()
+    progress = Progress(args, iteration, steps)
+    saved_at = time.monotonic()
     while steps < args.steps:
         if steps >= ends[part.number]:
-            number = part.number + 1
+            number, divergences = part.number + 1, part.env.divergences
             part = Part(number, stages[number], args, rank, policy, device)
+            part.env.divergences = divergences  # of the whole run
         if part.learner.measures and not part.actor.normalizer.count:  # the first rollout is for the normalizer alone
             part.observation, _ = collect(part.env, part.actor, part.critic, part.buffer, part.observation, generator)
             part.actor.normalizer.update(part.buffer.observation, all_reduce)
@@ -240,22 +273,22 @@ def train(rank: int, args, sync: str | None) -> None:
         iteration, steps = iteration + 1, steps + len(part.buffer) * args.processes
 
         means, sums = summarise(infos, part.buffer, part.env)
-        overdue = rank == 0 and time.time() - saved_at > 60 * args.save_minutes
-        shared = sum_over_processes(means | sums | {"stop": bool(stop), "save": overdue}, device)  # all must agree
+        overdue = rank == 0 and time.monotonic() - saved_at > 60 * args.save_minutes
+        told = {"stop": bool(stop) or orphaned(), "save": overdue}  # on which all must agree
+        shared = sum_over_processes(means | sums | told, device)
+        recent = np.vstack([recent[1:], [shared[name] for name in EPISODES]])
         if rank == 0:
             row = {"iteration": iteration, "steps": steps, "stage": part.number}
             row |= {name: shared[name] / args.processes for name in means}
             row |= {"sigma": part.actor.sigma().mean().item(), "learning_rate": part.learner.learning_rate} | losses
             row |= {"collect_seconds": collected - started, "update_seconds": updated - collected}
-            progress.log(row | {"divergences": int(shared["divergences"])}, shared)
+            progress.log(row | {"divergences": int(shared["divergences"])}, recent.sum(axis=0))
         if shared["save"] or shared["stop"] or steps >= args.steps:
             save()
-            saved_at = time.time()
+            saved_at = time.monotonic()
         if shared["stop"]:
             break
 
-    for number, handler in handlers.items():
-        signal.signal(number, handler)
     if rank == 0:
         policy_file = args.out / "policy.pt"
         if steps < args.steps:
@@ -280,17 +313,14 @@ def from_plain(value):
     return value.numpy() if isinstance(value, torch.Tensor) else value
 
 
-def guarded(rank: int, args, sync: str | None) -> None:
-    """`train`, with what a user can mend said in one line."""
-    try:
-        train(rank, args, sync)
-    except (OSError, FloatingPointError, ValueError) as error:
-        print(f"\nerror: {error}", file=sys.stderr)
-        os._exit(1)  # at once: the other processes wait for this one and are ended by the parent
-
-
 def identity(args) -> dict:
-    return {key: getattr(args, key) for key in (*IDENTITY, *(("steps",) if args.policy in STAGED else ()))}
+    """What a run may not change when it is resumed: its options, and the constants in the code."""
+    options = {key: getattr(args, key) for key in (*IDENTITY, *(("steps",) if args.policy in STAGED else ()))}
+    configs = PPOConfig(epochs=args.epochs, minibatches=args.minibatches), EnvConfig()
+    constants = {f"{type(c).__name__}.{name}": str(value) for c in configs for name, value in asdict(c).items()}
+    constants |= {f"weight of {term.__name__}": str(weight) for term, weight in REWARDS.items()}
+    constants["faults"] = ", ".join(f"{share:g} {fault}" for share, fault in TASKS[args.task].training)
+    return options | constants
 
 
 def train_all(words: list[str], args) -> None:
@@ -300,7 +330,7 @@ def train_all(words: list[str], args) -> None:
         out = Path("runs") / f"{args.robot}-{args.task}-{policy}-seed{args.seed}"
 
         def steps_done() -> int:
-            return checkpoint.load(out / "policy.pt")["steps"] if (out / "checkpoint.pt").exists() else 0
+            return checkpoint.load_policy(out / "policy.pt")[1]["steps"] if (out / "checkpoint.pt").exists() else 0
 
         done = steps_done()
         print(f"{policy}: {done:,} of {args.steps:,} steps", flush=True)
@@ -315,30 +345,16 @@ def main(argv: list[str] | None = None) -> None:
     try:
         if args.policy == "all":
             return train_all(sys.argv[1:] if argv is None else argv, args)
-        saved = checkpoint.load_newest(args.out / "checkpoint.pt", say=True) if args.resume else {"identity": identity(args)}
-        was = saved.get("identity", {})
-        if args.init:  # tried here, where it can be said in one line
-            checkpoint.start_from(args.init, args.robot, make_policy(args.policy, ROBOTS[args.robot], TASKS[args.task]))
-    except checkpoint.CheckpointError as error:
+        if args.resume:
+            was, now = checkpoint.load_newest(args.out / "checkpoint.pt", say=True).get("identity"), identity(args)
+            if not isinstance(was, dict):
+                fail(f"{args.out / 'checkpoint.pt'} is a policy, not a training to resume")
+            differing = [f"{key} was {was[key]}, is {now[key]}" for key in now if key in was and was[key] != now[key]]
+            if differing:
+                fail(f"the run in {args.out} was another one: {'; '.join(differing)}")
+    except CheckpointError as error:
         fail(error)
-    differing = [f"{key} was {was.get(key)}, is {now}" for key, now in identity(args).items() if was.get(key) != now]
-    if differing:
-        fail(f"the run in {args.out} was another one: {'; '.join(differing)}")
-    lock = lock_folder(args.out) if os.environ.get("RANK", "0") == "0" else None  # noqa: F841 (held until the end)
-    if "RANK" in os.environ:  # started by torchrun, which has made the processes
-        guarded(int(os.environ["RANK"]), args, "env://")
-    elif args.processes == 1:
-        guarded(0, args, None)
-    else:
-        with tempfile.TemporaryDirectory() as folder:
-            children = mp.spawn(guarded, (args, f"file://{folder}/sync"), nprocs=args.processes, join=False)
-            for signum in (signal.SIGINT, signal.SIGTERM):  # the children save and end; this process waits for them
-                signal.signal(signum, lambda number, _: [os.kill(p.pid, number) for p in children.processes if p.is_alive()])
-            try:
-                while not children.join():
-                    pass
-            except mp.ProcessExitedException as error:
-                sys.exit(f"process {error.error_index} ended early; {args.out} holds the last checkpoint: add --resume")
+    run(train, args)
 
 
 if __name__ == "__main__":

@@ -171,7 +171,7 @@ def test_wrong_use_is_refused():
         LocomotionEnv("a1", 0)
     env = LocomotionEnv("a1", 1, num_threads=1)
     env.reset()
-    with pytest.raises(ValueError, match="not finite"):
+    with pytest.raises(FloatingPointError, match="not finite"):
         env.step(np.full((1, 12), np.nan))
 
 
