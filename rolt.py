@@ -30,7 +30,7 @@ from scandots import SCAN_SHAPE
 
 SIGMA_BOUNDS = (math.log(0.05), math.log(2.0))  # ours
 
-Masks = dict[str, Tensor]  # name -> (B, ...) bool, True = keep; empty for a policy without dropout
+Masks = dict[str, Tensor]  # name -> (B, ...), True or 1 = keep; empty for a policy without dropout
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,12 @@ class ROLTConfig:
 
 def drop(x: Tensor, keep: Tensor | None, p: float) -> Tensor:
     """Consistent dropout: a stored mask `keep` of x's shape, kept values scaled by 1 / (1 - p); None = identity."""
-    return x if keep is None else x * keep.to(x.dtype).mul_(1 / (1 - p))
+    return x if keep is None else x * keep.to(x.dtype) * (1 / (1 - p))
+
+
+def add_dropped(x: Tensor, change: Tensor, keep: Tensor | None, p: float) -> Tensor:
+    """x + drop(change), in one pass over memory."""
+    return x + change if keep is None else torch.addcmul(x, change, keep.to(x.dtype), value=1 / (1 - p))
 
 
 class EncoderLayer(nn.Module):
@@ -81,8 +86,8 @@ class EncoderLayer(nn.Module):
         q, k, v = self._split(self.query(active)), self._split(self.key(normed)), self._split(self.value(normed))
         weights = torch.softmax(q @ k.transpose(-2, -1) * q.shape[-1] ** -0.5, dim=-1)  # (B, heads, queries, T)
         mixed = (weights @ v).transpose(1, 2).reshape(B, queries, D)  # (B, heads, queries, d) -> (B, queries, D)
-        x = x + drop(self.merge(mixed), keep_attention, self.p)
-        return x + drop(self.feedforward(self.norm_feedforward(x)), keep_feedforward, self.p), weights
+        x = add_dropped(x, self.merge(mixed), keep_attention, self.p)
+        return add_dropped(x, self.feedforward(self.norm_feedforward(x)), keep_feedforward, self.p), weights
 
     def _split(self, x: Tensor) -> Tensor:
         """(B, T, D) -> (B, heads, T, d)"""
@@ -169,7 +174,8 @@ class ROLT(nn.Module):
         patches = self.patch_embedding(patches.reshape(B, self.num_patches, s * s))  # (B, P, D)
         position = self.patch_position
         if "patch_position" in masks:
-            position = torch.where(masks["patch_position"][:, :, None], position, self.dropped_position)  # (B, P, D)
+            keep = masks["patch_position"].bool()[:, :, None]
+            position = torch.where(keep, position, self.dropped_position)  # (B, P, D)
         return torch.cat([proprioception, patches + position], dim=1)
 
     def _queries(self, layer: int) -> int:
