@@ -96,9 +96,14 @@ def gait_diagrams(panels: list[dict], legs: tuple[str, ...], dt: float, columns:
     """
     rows, framed = -(-len(panels) // columns), any(panel["frames"] for panel in panels)
     heights = [0.6, 0.16 * len(legs) + 0.2] if framed else [0.16 * len(legs) + 0.2]  # inches
-    figure = plt.figure(figsize=(6.0 * columns, (sum(heights) + 0.4) * rows + 0.4), layout="constrained")
-    for cell, panel in zip(figure.subfigures(rows, columns, squeeze=False).flat, panels):
-        axes = cell.subplots(len(heights), 1, sharex=True, height_ratios=heights, squeeze=False)[:, 0]
+    size = (6.0 * columns, (sum(heights) + 0.4) * rows + 0.4)
+    figure, grid = plt.subplots(
+        rows * len(heights), columns, figsize=size, height_ratios=heights * rows, layout="constrained", squeeze=False
+    )
+    cells = grid.reshape(rows, len(heights), columns).swapaxes(1, 2).reshape(-1, len(heights))  # (panels, 1 or 2)
+    for axis in cells[len(panels) :].flat:
+        axis.axis("off")
+    for axes, panel in zip(cells, panels):
         start, end = panel["time"][0], panel["time"][-1] + dt
         for y, foot in enumerate(panel["contacts"].T):
             axes[-1].broken_barh([(t, dt) for t in panel["time"][foot]], (y - 0.35, 0.7), color=f"C{y}", linewidth=0)
@@ -111,7 +116,8 @@ def gait_diagrams(panels: list[dict], legs: tuple[str, ...], dt: float, columns:
             extent = (start, start + len(panel["frames"]) * panel["frame_seconds"], 0, 1)
             axes[0].imshow(np.concatenate(panel["frames"], axis=1), extent=extent, aspect="auto")
             axes[0].axis("off")
-        axes[0].set_xlim(start, end)
+        for axis in axes:
+            axis.set_xlim(start, end)
         axes[0].set_title(panel["title"], fontsize=8, loc="left")
     figure.suptitle(title, fontsize=10)
     save_figure(figure, picture)
