@@ -7,17 +7,20 @@
     python evaluate.py dropout_ratio                      # why the dropout masks are stored
     python evaluate.py stiffness --methods rolt --episodes 8 --seconds 10 --out /tmp/quick
 
+    python evaluate.py watch --robot a1 --fault lock:FR_calf     # a viewer; see watch.py, or watch --help
+
 Each prints a table and writes EXPERIMENT.csv (one row an episode) and EXPERIMENT.png to --out (default: results).
 Policies act by their mean, without dropout. The same seed and the same number of threads give the same numbers.
 """
 
 import os
+import sys
 from dataclasses import replace
 from pathlib import Path
 
 import torch
 
-import render  # noqa: F401  first: it says how to draw without a display, which mujoco reads when it is imported
+import watch  # first: it says how to draw without a display, which mujoco reads when it is imported
 from baselines import METHODS
 from checkpoint import CheckpointError, load_policy
 from cli import Parser, count, fail, num_cores, positive, seed, writable_folder
@@ -164,6 +167,9 @@ def find_policies(args) -> dict[Path, tuple]:
 
 
 def main(argv: list[str] | None = None) -> None:
+    words = sys.argv[1:] if argv is None else argv
+    if words[:1] == ["watch"]:
+        return watch.main(words[1:])
     parser = Parser(__doc__)
     parser.add_argument("experiment", choices=EXPERIMENTS)
     parser.add_argument("--robot", default=None, help="default: the first one that the test is for")

@@ -83,18 +83,24 @@ def record(
     return Walk(env, list(faults), np.array(poses), np.array(contacts), steps)
 
 
-def draw(walk: Walk, robot: int, steps: range, width: int = 480, height: int = 300) -> list[np.ndarray]:
-    """(height, width, 3) uint8 frames of one of the robots at these steps. Links behind a fault are red."""
-    fault, legged = walk.faults[robot], walk.env.robot
-    model = copy.copy(walk.env.model)
+def painted(env: LocomotionEnv, fault: Fault) -> mujoco.MjModel:
+    """A copy of the env's model, the links behind the fault in red."""
+    model = copy.copy(env.model)
     faulty = (*fault.locked, *(part for part, _ in (*fault.strength, *fault.half_locked)))
     bodies = [f"{leg}_wheel" for leg in fault.skating]
-    bodies += [name for name, bad in zip(legged.joints, joint_mask(faulty, legged)) if bad]
+    bodies += [name for name, bad in zip(env.robot.joints, joint_mask(faulty, env.robot)) if bad]
     for body in bodies:
         model.geom_rgba[model.geom_bodyid == model.body(body).id] = [0.85, 0.2, 0.15, 1]
+    return model
+
+
+def draw(walk: Walk, robot: int, steps: range, width: int = 480, height: int = 300) -> list[np.ndarray]:
+    """(height, width, 3) uint8 frames of one of the robots at these steps."""
+    model = painted(walk.env, walk.faults[robot])
     renderer = make_renderer(model, width, height)
     data, camera, frames = mujoco.MjData(model), mujoco.MjvCamera(), []
-    camera.distance, camera.azimuth, camera.elevation = 1.3 * max(1.0, legged.trunk_box[0] / 0.38), 125, -18
+    camera.distance = 1.3 * max(1.0, walk.env.robot.trunk_box[0] / 0.38)  # m, the whole robot
+    camera.azimuth, camera.elevation = 125, -18
     for step in steps:
         data.qpos[:] = walk.poses[step, robot]
         mujoco.mj_kinematics(model, data)
