@@ -5,31 +5,37 @@
     python evaluate.py stairs                             # the paper's terrain, seeing and blind
     python evaluate.py low_frequency                      # and high_frequency, attention: scandots that lie
     python evaluate.py real_world                         # a Go1 with a weak leg, a box in tow, skates
+    python evaluate.py gaits --robot a1                   # which foot is on the ground when
     python evaluate.py dropout_ratio                      # why the dropout masks are stored
     python evaluate.py stiffness --methods rolt --episodes 8 --seconds 10 --out /tmp/quick
+
+    python evaluate.py watch --robot a1 --fault lock:FR_calf     # a viewer; see watch.py, or watch --help
 
 Each prints a table and writes EXPERIMENT.csv (one row an episode) and EXPERIMENT.png to --out (default: results).
 Policies act by their mean, without dropout. The same seed and the same number of threads give the same numbers.
 """
 
 import os
+import sys
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import torch
 
+import watch  # first: it says how to draw without a display, which mujoco reads when it is imported
 from baselines import METHODS
 from checkpoint import CheckpointError, load_policy
 from cli import Parser, count, fail, num_cores, positive, seed, writable_folder
 from env import CONTROL_DT, EnvConfig, LocomotionEnv
 from faults import REAL_WORLD, TASKS, healthy
+from gaits import gaits
 from noise import ScanNoise
 from paper import DAMAGE
 from paper import REAL_WORLD as REAL_WORLD_PAPER
 from plots import attention_maps, ratio_bands
 from ppo import Critic, PPOConfig, RolloutBuffer, collect, gaussian, to_tensors
-from protocol import report, report_curves, run_cases, write_csv
+from protocol import case_name, report, report_curves, run_cases, write_csv
 from rolt import ROLT
 from scandots import HEIGHT_SCALE, NUM_PATCHES
 from terrain import Terrain, rise
@@ -44,7 +50,7 @@ def stiffness(args) -> None:
     """
     task = TASKS["stiffness"]
     seen = [fault for _, fault in task.training]
-    cases = {"healthy" if f == healthy() else f.locked[0].split("_")[0]: f for f in (*seen, *task.unseen)}
+    cases = {case_name(fault): fault for fault in (*seen, *task.unseen)}
     rows = run_cases(args, cases, speed=0.75)
     marked = [
         f"{case}{'' if case == 'healthy' else ' locked'} ({'seen' if fault in seen else 'unseen'})"
@@ -61,7 +67,7 @@ def damage(args) -> None:
     """
     task = TASKS["damage"]
     faults = [fault for _, fault in task.training] + list(task.unseen)
-    cases = {"healthy" if f == healthy() else short_name(f.strength[0][0]): f for f in faults}
+    cases = {case_name(fault): fault for fault in faults}
     marked = [f"{case}{' (seen)' if i < len(task.training) else ''}" for i, case in enumerate(cases)]
     rows = run_cases(args, cases, speed=0.75)
     title = f"Damage test: {args.robot}, 0.75 m/s, {args.seconds:g} s"
@@ -156,12 +162,6 @@ def real_world(args) -> None:
     print("(paper): a physical Go1, 10 s")
 
 
-def short_name(joint: str) -> str:
-    """FL_calf -> FLC"""
-    leg, link = joint.split("_")
-    return leg + link[0].upper()
-
-
 @torch.no_grad()
 def dropout_ratio(args) -> None:
     """Not in the paper, but its case for consistency (section III-C) in one picture: PPO's ratio before any weight has
@@ -213,9 +213,13 @@ EXPERIMENTS = {
     "high_frequency": (high_frequency, "terrain", ("mlp", "roll-drop", "rma", "no-pe-drop", "no-feature-drop", "rolt")),
     "attention": (attention, "terrain", ("no-pe-drop", "rolt")),
     "real_world": (real_world, "stiffness", tuple(METHODS)),
+    "gaits": (gaits, None, tuple(METHODS)),  # any task that the robot has
     "dropout_ratio": (dropout_ratio, "stiffness", ("rolt",)),
 }
-DEFAULTS = {"real_world": {"robot": "go1", "seconds": 10.0}}  # where they are not the task's first robot and 20 s
+DEFAULTS = {  # where they are not the task's first robot, the paper's 20 s and all methods
+    "real_world": {"robot": "go1", "seconds": 10.0},
+    "gaits": {"seconds": 10.0, "methods": ("rolt", "rma")},
+}
 
 
 def find_policies(args) -> dict[Path, tuple]:
@@ -223,8 +227,7 @@ def find_policies(args) -> dict[Path, tuple]:
     if args.checkpoints:
         paths = args.checkpoints
     else:
-        _, task, suitable = EXPERIMENTS[args.experiment]
-        wanted = args.methods or suitable
+        task, wanted = args.task, args.methods or EXPERIMENTS[args.experiment][2]
         shipped = Path(os.path.relpath(Path(__file__).parent / "checkpoints"))
         named = {method: shipped / f"{args.robot}-{task}-{method}.pt" for method in wanted}
         paths = [path for path in named.values() if path.is_file()]
@@ -244,24 +247,29 @@ def find_policies(args) -> dict[Path, tuple]:
 
 
 def main(argv: list[str] | None = None) -> None:
+    words = sys.argv[1:] if argv is None else argv
+    if words[:1] == ["watch"]:
+        return watch.main(words[1:])
     parser = Parser(__doc__)
     parser.add_argument("experiment", choices=EXPERIMENTS)
     parser.add_argument("--robot", default=None, help="default: the first one that the test is for")
     parser.add_argument("--methods", nargs="+", choices=METHODS, help="which shipped checkpoints (default: all)")
     parser.add_argument("--checkpoints", nargs="+", type=Path, metavar="FILE", help="policy files, instead of the shipped")
     parser.add_argument("--episodes", type=count, default=32, help="a case (default 32)")
-    parser.add_argument("--seconds", type=positive, help="of an episode (default: the paper's 20; real_world 10)")
+    parser.add_argument("--seconds", type=positive, help="of an episode (default: the paper's 20; real_world, gaits 10)")
     parser.add_argument("--seed", type=seed, default=0, help="of the starts")
     parser.add_argument("--threads", type=count, default=num_cores(), help="cores to use (default: all)")
     parser.add_argument("--out", type=Path, default=Path("results"), help="folder of the CSV file and the picture")
     args = parser.parse_args(argv)
     function, task, suitable = EXPERIMENTS[args.experiment]
-    robots = TASKS[task].robots
+    robots = tuple(dict.fromkeys(robot for name in ([task] if task else TASKS) for robot in TASKS[name].robots))
     defaults = DEFAULTS.get(args.experiment, {})
     args.robot = args.robot or defaults.get("robot", robots[0])
     args.seconds = args.seconds or defaults.get("seconds", 20.0)
+    args.methods = args.methods or defaults.get("methods")
     if args.robot not in robots:
         fail(f"the test {args.experiment} is for {', '.join(robots)}, not for {args.robot}")
+    args.task = task or next(name for name, other in TASKS.items() if args.robot in other.robots)
     if args.seconds < CONTROL_DT:
         fail(f"an episode lasts at least {CONTROL_DT} s, not {args.seconds:g}")
     args.policies = find_policies(args)

@@ -164,6 +164,41 @@ def ratio_bands(rows: list[dict], picture: Path, title: str) -> None:
     save_figure(figure, picture)
 
 
+def gait_diagrams(panels: list[dict], legs: tuple[str, ...], dt: float, columns: int, picture: Path, title: str) -> None:
+    """A panel a walk: when each foot was on the ground (a bar), with frames of the robot above.
+
+    panels: "title", "time" (T,) s, a step of `dt` each, "contacts" (T, L) bool, "frames", images from the first step on, one
+    each "frame_seconds", or none.
+    """
+    rows, framed = -(-len(panels) // columns), any(panel["frames"] for panel in panels)
+    heights = [0.6, 0.16 * len(legs) + 0.2] if framed else [0.16 * len(legs) + 0.2]  # inches
+    size = (6.0 * columns, (sum(heights) + 0.4) * rows + 0.4)
+    figure, grid = plt.subplots(
+        rows * len(heights), columns, figsize=size, height_ratios=heights * rows, layout="constrained", squeeze=False
+    )
+    cells = grid.reshape(rows, len(heights), columns).swapaxes(1, 2).reshape(-1, len(heights))  # (panels, 1 or 2)
+    for axis in cells[len(panels) :].flat:
+        axis.axis("off")
+    for axes, panel in zip(cells, panels):
+        start, end = panel["time"][0], panel["time"][-1] + dt
+        for y, foot in enumerate(panel["contacts"].T):
+            axes[-1].broken_barh([(t, dt) for t in panel["time"][foot]], (y - 0.35, 0.7), color=f"C{y}", linewidth=0)
+        axes[-1].set_yticks(range(len(legs)), legs, fontsize=7)
+        axes[-1].set_ylim(len(legs) - 0.4, -0.6)  # the first leg on top
+        axes[-1].tick_params(axis="x", labelsize=7)
+        for i in range(len(panel["frames"])):
+            axes[-1].axvline(start + i * panel["frame_seconds"], color="black", linewidth=0.5, alpha=0.4)
+        if panel["frames"]:  # each begins at the line of its moment
+            extent = (start, start + len(panel["frames"]) * panel["frame_seconds"], 0, 1)
+            axes[0].imshow(np.concatenate(panel["frames"], axis=1), extent=extent, aspect="auto")
+            axes[0].axis("off")
+        for axis in axes:
+            axis.set_xlim(start, end)
+        axes[0].set_title(panel["title"], fontsize=8, loc="left")
+    figure.suptitle(title, fontsize=10)
+    save_figure(figure, picture)
+
+
 def save_figure(figure, picture: Path) -> None:
     """Writes the picture whole or not at all."""
     temporary = picture.with_name("." + picture.name)

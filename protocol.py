@@ -55,6 +55,13 @@ def run_episodes(
     return {"distance_m": distance, "fall_time_s": fall_time, "episode_return": returns}
 
 
+def case_name(fault: Fault) -> str:
+    """healthy, FL for a locked FL_calf, FLC for a dead motor of FL_calf"""
+    if fault.locked:
+        return fault.locked[0].split("_")[0]
+    return fault.strength[0][0].replace("_", "")[:3].upper() if fault.strength else "healthy"
+
+
 def run_cases(args, cases: dict[str, Fault], speed: float, **env_options) -> list[dict]:
     """Every checkpoint on every case, `args.episodes` robots each: the rows of the CSV file."""
     faults = [fault for fault in cases.values() for _ in range(args.episodes)]

@@ -6,12 +6,16 @@
 Works without a display through EGL (set MUJOCO_GL yourself for another way, such as osmesa).
 """
 
+import copy
 import os
 import sys
 from pathlib import Path
+from typing import NamedTuple
 
-if sys.platform == "linux" and not os.environ.get("DISPLAY"):
-    os.environ.setdefault("MUJOCO_GL", "egl")  # read by mujoco when it is imported
+TOO_LATE = False
+if sys.platform == "linux" and not os.environ.get("DISPLAY") and "MUJOCO_GL" not in os.environ:
+    TOO_LATE = "mujoco" in sys.modules  # which reads the variable when it is imported
+    os.environ["MUJOCO_GL"] = "egl"
 
 import mujoco  # noqa: E402
 import numpy as np  # noqa: E402
@@ -23,10 +27,13 @@ from cli import Parser, fail, positive, seed, writable_folder  # noqa: E402
 from env import CONTROL_DT, EnvConfig, LocomotionEnv  # noqa: E402
 from faults import Fault, joint_mask, parse  # noqa: E402
 from ppo import to_tensors  # noqa: E402
+from terrain import Terrain  # noqa: E402
 
 
 def make_renderer(model: mujoco.MjModel, width: int, height: int) -> mujoco.Renderer:
     """RuntimeError with the way out where off-screen rendering does not work."""
+    if TOO_LATE:  # it would not raise an error but end the process
+        raise RuntimeError("cannot render: import render before anything that imports mujoco, or set MUJOCO_GL=egl")
     try:
         return mujoco.Renderer(model, height, width)
     except Exception as error:  # each backend fails in its own way
@@ -36,41 +43,92 @@ def make_renderer(model: mujoco.MjModel, width: int, height: int) -> mujoco.Rend
         ) from error
 
 
+def problem() -> str | None:
+    """Why nothing can be drawn here, or None."""
+    try:
+        make_renderer(mujoco.MjSpec().compile(), 16, 16).close()
+    except RuntimeError as error:
+        return str(error)
+    return None
+
+
+class Walk(NamedTuple):
+    """What N robots did, step by step: T steps, L legs. What follows a robot's first fall means nothing."""
+
+    env: LocomotionEnv
+    faults: list[Fault]
+    poses: np.ndarray  # (T, N, nq), MuJoCo's qpos
+    contacts: np.ndarray  # (T, N, L) bool, which feet were on the ground
+    steps: np.ndarray  # (N,) up to the first fall
+
+
 @torch.no_grad()
-def film(
-    policy, robot: str, fault: Fault, seconds: float, every: int, width: int = 480, height: int = 300,
-    speed: float = 0.75, seed: int = 0, warm_up: float = 2.0,
-) -> list[np.ndarray]:  # fmt: skip
-    """(height, width, 3) uint8 frames of one robot that walks straight on, one each `every` control steps, after
-    `warm_up` seconds. Links behind a fault are red. The film ends where the robot falls.
-    """
-    config = EnvConfig(forward_speed=(speed, speed), heading=(0.0, 0.0), push_speed=0.0, episode_seconds=3600)
-    env = LocomotionEnv(robot, 1, seed, 1, ((1.0, fault),), config, policy.extras)
-    observation = env.reset()
-    model = env.world.get_model(0)  # with what the fault changed on it
+def record(
+    policy, robot: str, faults: list[Fault], seconds: float, speed: float = 0.75, seed: int = 0, threads: int = 1,
+    terrain: Terrain | None = None,
+) -> Walk:  # fmt: skip
+    """One robot a fault walks straight on at `speed` until all have fallen or the time is up. Nobody is pushed."""
+    config = EnvConfig(
+        forward_speed=(speed, speed), heading=(0.0, 0.0), push_speed=0.0, episode_seconds=seconds + 1.0, start_rows=1
+    )
+    situations = [(1.0, fault) for fault in faults]
+    env = LocomotionEnv(robot, len(faults), seed, threads, situations, config, policy.extras, terrain)
+    env.pin_faults(faults)  # one each
+    observation, poses, contacts = env.reset(), [], []
+    feet = [env.model.sensor(f"contact_{leg}_foot").adr[0] for leg in env.robot.legs]
+    upright, steps = np.ones(len(faults), dtype=bool), np.zeros(len(faults), dtype=int)
+    for _ in range(round(seconds / CONTROL_DT)):
+        poses.append(env.world.bind("qpos").copy())
+        contacts.append(env.world.bind("sensordata")[:, feet] > 0)
+        steps += upright
+        observation, _, terminated, _, _ = env.step(policy(to_tensors(observation, "cpu")).numpy())
+        upright &= ~terminated
+        if not upright.any():
+            break
+    return Walk(env, list(faults), np.array(poses), np.array(contacts), steps)
+
+
+def painted(env: LocomotionEnv, fault: Fault) -> mujoco.MjModel:
+    """A copy of the env's model, the links behind the fault in red."""
+    model = copy.copy(env.model)
     faulty = (*fault.locked, *(part for part, _ in (*fault.strength, *fault.half_locked)))
     bodies = [f"{leg}_wheel" for leg in fault.skating]
     bodies += [name for name, bad in zip(env.robot.joints, joint_mask(faulty, env.robot)) if bad]
     for body in bodies:
         model.geom_rgba[model.geom_bodyid == model.body(body).id] = [0.85, 0.2, 0.15, 1]
+    return model
+
+
+def draw(walk: Walk, robot: int, steps: range, width: int = 480, height: int = 300) -> list[np.ndarray]:
+    """(height, width, 3) uint8 frames of one of the robots at these steps."""
+    model = painted(walk.env, walk.faults[robot])
     renderer = make_renderer(model, width, height)
     data, camera, frames = mujoco.MjData(model), mujoco.MjvCamera(), []
-    camera.distance, camera.azimuth, camera.elevation = 1.3, 125, -18
-    start = round(warm_up / CONTROL_DT)
-    for step in range(start + round(seconds / CONTROL_DT)):
-        if step >= start and (step - start) % every == 0:
-            data.qpos[:] = env.world.bind("qpos")[0]
-            mujoco.mj_forward(model, data)
-            camera.lookat[:] = [data.qpos[0], data.qpos[1], 0.18]
-            renderer.update_scene(data, camera)
-            frames.append(renderer.render().copy())
-        observation, _, terminated, _, _ = env.step(policy(to_tensors(observation, "cpu")).numpy())
-        if terminated[0]:
-            break
+    camera.distance = 1.3 * max(1.0, walk.env.robot.trunk_box[0] / 0.38)  # m, the whole robot
+    camera.azimuth, camera.elevation = 125, -18
+    for step in steps:
+        data.qpos[:] = walk.poses[step, robot]
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_camlight(model, data)
+        mujoco.mj_tendon(model, data)
+        camera.lookat[:] = data.qpos[:3] - [0, 0, 0.08]  # on flat ground 0.2 m up
+        renderer.update_scene(data, camera)
+        frames.append(renderer.render().copy())
     renderer.close()
-    if not frames:
-        raise ValueError(f"with {fault} the robot falls within {warm_up:g} s: there is nothing to show")
     return frames
+
+
+def film(
+    policy, robot: str, fault: Fault, seconds: float, every: int, width: int = 480, height: int = 300,
+    speed: float = 0.75, seed: int = 0, warm_up: float = 2.0, terrain: Terrain | None = None,
+) -> list[np.ndarray]:  # fmt: skip
+    """Frames of one robot that walks straight on, one each `every` control steps, after `warm_up` seconds. The film ends
+    where the robot falls."""
+    walk = record(policy, robot, [fault], warm_up + seconds, speed, seed, terrain=terrain)
+    steps = range(round(warm_up / CONTROL_DT), walk.steps[0], every)
+    if not steps:
+        raise ValueError(f"with {fault} the robot falls within {warm_up:g} s: there is nothing to show")
+    return draw(walk, 0, steps, width, height)
 
 
 def write_gif(frames: list[np.ndarray], path: Path, seconds_a_frame: float) -> None:
@@ -101,6 +159,7 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--seconds", type=positive, default=4.0, help="of a GIF (default 4)")
     parser.add_argument("--speed", type=positive, default=0.75, help="commanded, m/s")
     parser.add_argument("--seed", type=seed, default=0)
+    parser.add_argument("--stairs", type=int, choices=range(11), metavar="LEVEL", help="0 to 10, instead of flat ground")
     parser.add_argument("--out", type=Path, default=Path("walk.gif"), help="a .gif or .png file")
     args = parser.parse_args(argv)
     if args.out.suffix not in (".gif", ".png"):
@@ -109,7 +168,8 @@ def main(argv: list[str] | None = None) -> None:
         policy, card = load_policy(args.checkpoint)
         faults = [parse(text) for text in args.fault]
         writable_folder(args.out.parent)
-        options = {"speed": args.speed, "seed": args.seed}
+        terrain = None if args.stairs is None else Terrain(("stairs",), (args.stairs,) * 9)
+        options = {"speed": args.speed, "seed": args.seed, "terrain": terrain}
         if args.out.suffix == ".gif":
             frames = film(policy, card["robot"], faults[0], args.seconds, 2, **options)
             write_gif(frames, args.out, 2 * CONTROL_DT)

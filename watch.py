@@ -1,0 +1,235 @@
+"""A trained policy to look at while it walks, with its fault and its command to change on the way.
+
+    python evaluate.py watch                                          # the A1, healthy
+    python evaluate.py watch --robot a1 --fault lock:FR_calf --speed 0.5
+    python evaluate.py watch --fault tow:RR --video tow.gif           # no viewer, a moving picture
+
+Where there is a display, a window of MuJoCo's viewer opens: the keys up and down change the speed, left and right the
+fault. Elsewhere MuJoCo's browser viewer is served; its panel does the same. (It is open to everybody who can reach the
+port; from another machine it wants `ssh -L 8080:localhost:8080`.) Either way the terminal takes the same words: a fault
+("lock:RL_calf", "healthy"), a speed ("0.5"), "again" to start over, "quit". A robot that falls starts over by itself.
+"""
+
+import os
+import queue
+import sys
+import threading
+import time
+from pathlib import Path
+
+import render  # first: it says how to draw without a display, which mujoco reads when it is imported
+import mujoco
+import numpy as np
+import torch
+
+from checkpoint import CheckpointError, load_policy
+from cli import Parser, fail, positive, seed, writable_folder
+from env import CONTROL_DT, EnvConfig, LocomotionEnv
+from faults import REAL_WORLD, TASKS, Fault, healthy, parse, props, write_fault
+from ppo import to_tensors
+from robots import ROBOTS
+
+HELP = "type a fault (lock:RL_calf, healthy, ...), a speed (0.5), again or quit"
+
+
+class Show:
+    """One robot that walks straight on for ever. `model` and `data` are what a viewer shows; they are new objects after some
+    changes. `said` is the answer to the last wish."""
+
+    def __init__(self, policy, robot: str, fault: Fault = healthy(), speed: float = 0.75, seed: int = 0):
+        self.policy, self.robot, self.fault, self.speed, self.seed = policy, robot, fault, speed, seed
+        task = next(task for task in TASKS.values() if robot in task.robots)
+        self.menu = [fault for _, fault in task.training] + list(task.unseen)
+        self.menu += REAL_WORLD.values() if "go1" in task.robots else ()
+        self.wishes, self.said, self.over = queue.Queue(), HELP, False
+        self.start()
+
+    def start(self) -> None:
+        """A new episode in a new env."""
+        config = EnvConfig(lateral_speed=(0.0, 0.0), heading=(0.0, 0.0), push_speed=0.0, episode_seconds=3600)
+        self.env = LocomotionEnv(self.robot, 1, self.seed, 1, [(1.0, self.fault)], config, self.policy.extras)
+        self.observation = self.env.reset()
+        self.model = render.painted(self.env, self.fault)
+        self.data = mujoco.MjData(self.model)
+
+    def set_fault(self, fault: Fault) -> None:
+        """Without a fall or a reset, unless a box or wheels come or go. ValueError if the robot has no such part."""
+        if props([fault]) == props([self.fault]):
+            write_fault(fault, self.env.robot, self.env.world, np.array([0]))
+            self.env.pin_faults([fault])  # at the next resets, too
+            self.fault, self.model = fault, render.painted(self.env, fault)
+        else:
+            before, self.fault = self.fault, fault
+            try:
+                self.start()
+            except ValueError:
+                self.fault = before
+                raise
+
+    def obey(self, wish: str) -> None:
+        """One of the words that HELP lists. What it cannot read changes nothing, and `said` tells why."""
+        try:
+            if wish == "quit":
+                self.over = True
+            elif wish == "again":
+                self.start()
+            elif wish.replace(".", "", 1).isdecimal():
+                self.speed = float(wish)
+            elif wish:
+                self.set_fault(parse(wish))
+            self.said = f"{self.fault}, {self.speed:g} m/s"
+        except ValueError as error:
+            self.said = str(error)
+        print(self.said, flush=True)
+
+    @torch.no_grad()
+    def step(self) -> None:
+        """Wishes, and one control step of 20 ms."""
+        while not self.wishes.empty():
+            self.obey(self.wishes.get().strip())
+        self.env.command[:, 0] = self.speed
+        action = self.policy(to_tensors(self.observation, "cpu")).numpy()
+        self.observation, _, fallen, _, _ = self.env.step(action)
+        if fallen[0]:
+            print("it fell and starts over", flush=True)
+        self.data.qpos[:] = self.env.world.bind("qpos")[0]
+        self.data.time += CONTROL_DT
+
+
+class Clock:
+    """Holds the loop at real time; a loop that is too slow is not made up for."""
+
+    def __init__(self):
+        self.due = time.monotonic()
+
+    def wait(self) -> None:
+        now = time.monotonic()
+        self.due = max(self.due + CONTROL_DT, now - CONTROL_DT)
+        time.sleep(max(0.0, self.due - now))
+
+
+def listen(show: Show) -> None:
+    """Lines typed in the terminal are wishes."""
+    threading.Thread(target=lambda: [show.wishes.put(line) for line in sys.stdin], daemon=True).start()
+
+
+def has_display() -> bool:
+    return sys.platform != "linux" or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+
+
+def desktop(show: Show) -> None:
+    """A window of mujoco.viewer, opened anew when a box or wheels come or go. Closing it ends the show."""
+    import mujoco.viewer
+
+    def key(code: int) -> None:  # GLFW's codes
+        if code in (265, 264):  # up, down
+            show.wishes.put(f"{max(0.0, show.speed + (0.1 if code == 265 else -0.1)):.2f}")
+        if code in (262, 263):  # right, left
+            here = show.menu.index(show.fault) if show.fault in show.menu else 0
+            show.wishes.put(str(show.menu[(here + (1 if code == 262 else -1)) % len(show.menu)]))
+
+    clock, closed = Clock(), False
+    while not (show.over or closed):
+        model, data = show.model, show.data
+        with mujoco.viewer.launch_passive(model, data, key_callback=key, show_left_ui=False, show_right_ui=False) as viewer:
+            track(viewer.cam)
+            while show.data is data and not (show.over or closed):
+                with viewer.lock():
+                    show.step()
+                    model.geom_rgba[:] = show.model.geom_rgba if show.data is data else model.geom_rgba
+                    mujoco.mj_forward(model, data)
+                viewer.sync()
+                clock.wait()
+                closed = not viewer.is_running()
+
+
+def browser(show: Show, port: int = 0) -> None:
+    """MuJoCo's viewer as a web page, with a panel of our own. `port` 0: the first free one from 8080 on."""
+    from mujoco.studio import launch_web, messages, plugin, viewer_protocol
+    from mujoco.studio.dear_imgui import dear_imgui as imgui
+
+    names = [str(fault) for fault in show.menu]
+
+    class Panel(plugin.ViewerPlugin):
+        """Runs in the viewer's thread, so it only reads the show and puts wishes in its queue."""
+
+        text = str(show.fault)
+
+        @messages.handler
+        def aim(self, _: messages.PostModelEvent) -> None:
+            track(self.viewer.camera)
+
+        @messages.handler
+        def draw(self, _: messages.BuildGuiEvent) -> None:
+            imgui.SetNextWindowPos(imgui.Vec2(20, 20), imgui.Cond.FirstUseEver)
+            imgui.SetNextWindowSize(imgui.Vec2(420, 170), imgui.Cond.FirstUseEver)
+            if imgui.Begin("Walk")[0]:
+                imgui.TextUnformatted(show.said)
+                moved, speed = imgui.SliderFloat("m/s", show.speed, 0.0, 1.0, "%.2f")
+                if moved:
+                    show.wishes.put(f"{speed:.2f}")
+                chosen, index = imgui.Combo("fault", names.index(str(show.fault)) if str(show.fault) in names else -1, names)
+                if chosen:
+                    show.wishes.put(names[index])
+                _, self.text = imgui.InputText("or write one", self.text)
+                if imgui.Button("set it"):
+                    show.wishes.put(self.text)
+                imgui.SameLine()
+                if imgui.Button("again"):
+                    show.wishes.put("again")
+            imgui.End()
+
+    config, clock = viewer_protocol.ViewerConfig(title=f"ROLT: {show.robot}", gfx="web", http_port=port), Clock()
+    with launch_web.launch(config, plugins=[Panel()]) as handle:
+        while handle.is_running() and not show.over:
+            show.step()
+            handle.sync(show.model, show.data)
+            clock.wait()
+
+
+def track(camera) -> None:
+    camera.type, camera.trackbodyid = mujoco.mjtCamera.mjCAMERA_TRACKING, 1  # the trunk
+    camera.distance, camera.azimuth, camera.elevation = 1.8, 125, -18
+
+
+def main(argv: list[str] | None = None) -> None:
+    parser = Parser(__doc__)
+    parser.add_argument("--robot", default="a1", choices=ROBOTS)
+    parser.add_argument("--checkpoint", type=Path, metavar="FILE", help="default: the shipped ROLT of the robot")
+    parser.add_argument("--fault", default="healthy", help="e.g. lock:FR_calf+weaken:RL:0.5 (default healthy)")
+    parser.add_argument("--speed", type=positive, default=0.75, help="commanded, m/s (default 0.75)")
+    parser.add_argument("--seed", type=seed, default=0)
+    parser.add_argument("--viewer", choices=("desktop", "browser"), help="default: desktop where there is a display")
+    parser.add_argument("--port", type=int, default=0, help="of the browser viewer (default: the first free from 8080 on)")
+    parser.add_argument("--video", type=Path, metavar="FILE.gif", help="write a moving picture instead")
+    parser.add_argument("--seconds", type=positive, default=4.0, help="of the moving picture (default 4)")
+    args = parser.parse_args(argv)
+    task = next(name for name, task in TASKS.items() if args.robot in task.robots)
+    shipped = Path(os.path.relpath(Path(__file__).parent / "checkpoints")) / f"{args.robot}-{task}-rolt.pt"
+    if args.video and args.video.suffix != ".gif":
+        fail(f"--video is a .gif file, not {args.video}")
+    torch.set_num_threads(1)
+    try:
+        policy, _ = load_policy(args.checkpoint or shipped, args.robot)
+        fault = parse(args.fault)
+        if args.video:
+            writable_folder(args.video.parent)
+            render.write_gif(
+                render.film(policy, args.robot, fault, args.seconds, 2, speed=args.speed, seed=args.seed), args.video,
+                2 * CONTROL_DT,
+            )  # fmt: skip
+            print(f"written: {args.video}")
+            return
+        show = Show(policy, args.robot, fault, args.speed, args.seed)
+        print(HELP)
+        listen(show)
+        kind = args.viewer or ("desktop" if has_display() else "browser")
+        desktop(show) if kind == "desktop" else browser(show, args.port)
+    except KeyboardInterrupt:
+        pass
+    except (CheckpointError, ValueError, RuntimeError, ImportError, OSError) as error:
+        fail(error)
+
+
+if __name__ == "__main__":
+    main()
