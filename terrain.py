@@ -103,7 +103,7 @@ class Terrain:
                 x, y = TILE * (row + 0.5), TILE * column
                 if kind == "stairs":
                     for step in range(STEPS):
-                        _add_box(spec, x, y, HALF - TREAD * step, rise(level) * (step + 1))
+                        _add_box(spec, x, y, HALF - TREAD * step, rise(level) * (step + 1), shade=step % 2)
                 elif kind == "slope" and level > 0:
                     _add_frustum(spec, x, y, SLOPE_RUN * gradient(level), f"slope_{row}_{column}")
                 elif kind == "platforms":
@@ -129,13 +129,14 @@ class Terrain:
 # for a robot that stands 30 cm high.
 TRAINING_MAP = Terrain(columns=("stairs", "slope", "stairs", "platforms", "flat"), levels=(0, 1, 2, 3, 4, 5))
 
-_SOLID = {"contype": 1, "conaffinity": 0, "rgba": [0.75, 0.73, 0.70, 1]}  # collides with robots, as the ground does
+_SOLID = {"contype": 1, "conaffinity": 0}  # collides with robots, as the ground does
+_SHADES = [0.80, 0.77, 0.72, 1], [0.55, 0.53, 0.50, 1]  # one step from the next
 
 
-def _add_box(spec: mujoco.MjSpec, x: float, y: float, half: float, top: float) -> None:
+def _add_box(spec: mujoco.MjSpec, x: float, y: float, half: float, top: float, shade: int = 0) -> None:
     """A square box on the ground."""
     box = {"type": mujoco.mjtGeom.mjGEOM_BOX, "size": [half, half, top / 2], "pos": [x, y, top / 2]}
-    spec.worldbody.add_geom(**box, **_SOLID)
+    spec.worldbody.add_geom(**box, **_SOLID, rgba=_SHADES[shade])
 
 
 def _add_frustum(spec: mujoco.MjSpec, x: float, y: float, top: float, name: str) -> None:
@@ -145,7 +146,7 @@ def _add_frustum(spec: mujoco.MjSpec, x: float, y: float, top: float, name: str)
     vertices = np.concatenate([np.c_[base, np.zeros(4)], np.c_[platform, np.full(4, top)]])
     mesh = spec.add_mesh(name=name)
     mesh.uservert = vertices.ravel()
-    spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=name, pos=[x, y, 0], **_SOLID)
+    spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=name, pos=[x, y, 0], rgba=_SHADES[0], **_SOLID)
 
 
 def main() -> None:
