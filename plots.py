@@ -35,7 +35,7 @@ def learning_curve(progress: Path, picture: Path) -> None:
         axis.set_title(title, fontsize=10)
         axis.grid(alpha=0.3)
         if len(names) > 1:
-            axis.legend(fontsize=8, frameon=False)
+            axis.legend(fontsize=8, frameon=False, loc="upper left")  # "best" takes a second and warns of it
     for axis in axes[1]:
         axis.set_xlabel("env steps [million]")
     save_figure(figure, picture)

@@ -8,6 +8,7 @@ Works without a display through EGL (set MUJOCO_GL yourself for another way, suc
 
 import os
 import sys
+from functools import partial
 from pathlib import Path
 
 if sys.platform == "linux" and not os.environ.get("DISPLAY"):
@@ -97,8 +98,8 @@ def main(argv: list[str] | None = None) -> None:
     parser = Parser(__doc__)
     parser.add_argument("checkpoint", type=Path)
     parser.add_argument("--fault", nargs="+", default=["healthy"], help="a row of the strip each; a GIF shows the first")
-    parser.add_argument("--seconds", type=positive, default=4.0, help="of a GIF (default 4)")
-    parser.add_argument("--speed", type=positive, default=0.75, help="commanded, m/s")
+    parser.add_argument("--seconds", type=partial(positive, most=120), default=4.0, help="of a GIF (default 4)")
+    parser.add_argument("--speed", type=partial(positive, most=10), default=0.75, help="commanded, m/s")
     parser.add_argument("--seed", type=seed, default=0)
     parser.add_argument("--out", type=Path, default=Path("walk.gif"), help="a .gif or .png file")
     args = parser.parse_args(argv)
@@ -115,7 +116,7 @@ def main(argv: list[str] | None = None) -> None:
         else:
             rows = {str(f): film(policy, card["robot"], f, 0.6, 5, 300, 240, **options) for f in faults}
             write_strip(rows, args.out)
-    except (CheckpointError, ValueError, RuntimeError) as error:
+    except (CheckpointError, OSError, FloatingPointError, ValueError, RuntimeError) as error:
         fail(error)
     print(f"written: {args.out}")
 

@@ -229,12 +229,12 @@ def train(rank: int, args, sync: str | None, stop: list) -> None:
         (iteration, steps, _), recent, mine = place, saved["recent"].numpy(), saved["processes"][rank]
         policy.load_state_dict(saved["weights"])
         part.critic.load_state_dict(saved["critic"])
-        part.learner.load_state_dict(saved["learner"])
         try:
+            part.learner.load_state_dict(saved["learner"])
             part.env.load_state_dict(from_plain(mine["env"]))
             generator.set_state(mine["generator"])
             torch.set_rng_state(saved["torch"])
-        except (ValueError, IndexError, OverflowError, RuntimeError) as error:  # no random state, no fault of this task
+        except (ValueError, LookupError, OverflowError, RuntimeError) as error:  # e.g. no random state, a fault that is not
             raise CheckpointError(f"the checkpoint in {args.out} does not fit this run: {error}") from error
         part.observation = part.env.observe()
 
