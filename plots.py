@@ -19,6 +19,8 @@ def learning_curve(progress: Path, picture: Path) -> None:
                 rows.append({name: float(value) for name, value in row.items()})
             except (TypeError, ValueError):  # a torn row
                 pass
+    if not rows:
+        return
     column = {name: np.array([row[name] for row in rows]) for name in rows[0]}
     steps = column["steps"] / 1e6
     figure, axes = plt.subplots(2, 2, figsize=(9, 5.5), sharex=True, layout="constrained")

@@ -122,7 +122,7 @@ class Progress:
         number, returns, lengths, falls = episodes.tolist()
         recent = [x / number if number else math.nan for x in (returns, lengths * CONTROL_DT, falls)]
         row |= dict(zip(("episode_return", "episode_seconds", "falls"), recent))
-        if not self.begun:
+        if not self.begun or not self.path.exists():
             self._begin(",".join(row))
         with open(self.path, "a") as file:
             file.write(",".join(f"{x:.6g}" if isinstance(x, float) else str(x) for x in row.values()) + "\n")
