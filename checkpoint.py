@@ -80,8 +80,7 @@ def load(path: str | Path) -> dict:
             if altered := archive.testzip():
                 raise ValueError(f"the checksum of {altered} is wrong")
         content = torch.load(path, map_location="cpu", weights_only=True)
-        numbers = [(name, x) for name, x in tensors(content) if x.is_floating_point()]
-        bad = [name for name, x in numbers if not torch.isfinite(x).all()]
+        bad = [name for name, x in numbers(content) if not torch.isfinite(x).all()]
     except Exception as error:  # whatever damaged bytes provoke in zip, pickle or torch
         raise CheckpointError(f"{path} is not a whole checkpoint ({type(error).__name__}): copy or train it again") from error
     if not isinstance(content, dict) or type(content.get("format")) is not int or content["format"] != FORMAT:
@@ -91,22 +90,25 @@ def load(path: str | Path) -> dict:
     return content
 
 
-def tensors(value, name: str = ""):
-    """(name, tensor) of all that is in nested dictionaries and lists, e.g. ("weights.decoder.bias", ...)."""
-    if isinstance(value, torch.Tensor):
-        yield name, value
+def numbers(value, name: str = ""):
+    """(name, tensor) of all tensors and floats in nested dictionaries and lists, e.g. ("weights.decoder.bias", ...)."""
+    if isinstance(value, torch.Tensor | float):
+        yield name, torch.as_tensor(value)
     elif isinstance(value, dict | list | tuple):
         for key, item in value.items() if isinstance(value, dict) else enumerate(value):
-            yield from tensors(item, f"{name}.{key}".lstrip("."))
+            yield from numbers(item, f"{name}.{key}".lstrip("."))
 
 
 def misfit(saved, own, name: str) -> str | None:
-    """What keeps `saved` from taking the place of `own`: another key, type, length, shape or dtype. None if nothing does."""
+    """What keeps `saved` from taking the place of `own`: another key, type, length, shape, dtype, or list of whole numbers
+    (the optimiser's indices of parameters). None if nothing does."""
     if isinstance(own, dict) and isinstance(saved, dict):
         if odd := [str(key) for key in own if key not in saved] + [str(key) for key in saved if key not in own]:
             return f"{name}.{odd[0]} is {'missing' if odd[0] in map(str, own) else 'unknown'}"
         pairs = [(saved[key], own[key], f"{name}.{key}") for key in own]
     elif isinstance(own, list) and isinstance(saved, list) and len(own) == len(saved):
+        if own and isinstance(own[0], int) and saved != own:
+            return f"{name} is {saved}, not {own}"
         pairs = [(a, b, f"{name}.{i}") for i, (a, b) in enumerate(zip(saved, own))]
     elif isinstance(own, torch.Tensor) and isinstance(saved, torch.Tensor):
         forms = [(tuple(x.shape), x.dtype, x.layout) for x in (saved, own)]

@@ -18,6 +18,7 @@ Policies act by their mean, without dropout. The same seed and the same number o
 import os
 import sys
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -26,7 +27,7 @@ import torch
 import watch  # first: it says how to draw without a display, which mujoco reads when it is imported
 from baselines import METHODS
 from checkpoint import CheckpointError, load_policy
-from cli import Parser, count, fail, num_cores, positive, seed, writable_folder
+from cli import Parser, count, fail, num_cores, positive, seed, threads, writable_folder
 from env import CONTROL_DT, EnvConfig, LocomotionEnv
 from faults import REAL_WORLD, TASKS, healthy
 from gaits import gaits
@@ -255,10 +256,11 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--robot", default=None, help="default: the first one that the test is for")
     parser.add_argument("--methods", nargs="+", choices=METHODS, help="which shipped checkpoints (default: all)")
     parser.add_argument("--checkpoints", nargs="+", type=Path, metavar="FILE", help="policy files, instead of the shipped")
-    parser.add_argument("--episodes", type=count, default=32, help="a case (default 32)")
-    parser.add_argument("--seconds", type=positive, help="of an episode (default: the paper's 20; real_world, gaits 10)")
+    parser.add_argument("--episodes", type=partial(count, most=10_000), default=32, help="a case (default 32)")
+    seconds = partial(positive, most=3600)
+    parser.add_argument("--seconds", type=seconds, help="of an episode (default: the paper's 20; real_world, gaits 10)")
     parser.add_argument("--seed", type=seed, default=0, help="of the starts")
-    parser.add_argument("--threads", type=count, default=num_cores(), help="cores to use (default: all)")
+    parser.add_argument("--threads", type=threads, default=num_cores(), help="cores to use (default: all)")
     parser.add_argument("--out", type=Path, default=Path("results"), help="folder of the CSV file and the picture")
     args = parser.parse_args(argv)
     function, task, suitable = EXPERIMENTS[args.experiment]
@@ -278,7 +280,10 @@ def main(argv: list[str] | None = None) -> None:
         fail(f"{args.experiment} is for {', '.join(suitable)}, not for {', '.join(sorted(unsuitable))}")
     writable_folder(args.out)
     torch.set_num_threads(args.threads)
-    function(args)
+    try:
+        function(args)
+    except (OSError, FloatingPointError) as error:  # a full disk; weights so large that actions are not finite
+        fail(error)
 
 
 if __name__ == "__main__":

@@ -19,6 +19,8 @@ def learning_curve(progress: Path, picture: Path) -> None:
                 rows.append({name: float(value) for name, value in row.items()})
             except (TypeError, ValueError):  # a torn row
                 pass
+    if not rows:
+        return
     column = {name: np.array([row[name] for row in rows]) for name in rows[0]}
     steps = column["steps"] / 1e6
     figure, axes = plt.subplots(2, 2, figsize=(9, 5.5), sharex=True, layout="constrained")
@@ -35,7 +37,7 @@ def learning_curve(progress: Path, picture: Path) -> None:
         axis.set_title(title, fontsize=10)
         axis.grid(alpha=0.3)
         if len(names) > 1:
-            axis.legend(fontsize=8, frameon=False)
+            axis.legend(fontsize=8, frameon=False, loc="upper left")  # "best" takes a second and warns of it
     for axis in axes[1]:
         axis.set_xlabel("env steps [million]")
     save_figure(figure, picture)

@@ -74,10 +74,10 @@ def in_processes(train, args) -> None:
             process.start()
         for number in SIGNALS:
             signal.signal(number, lambda *_: [process.terminate() for process in processes])
-        while running := [process.sentinel for process in processes if process.exitcode is None]:
-            wait(running)
-            if any(process.exitcode for process in processes):
-                break
+        codes = [None] * args.processes
+        while None in codes and not any(codes):
+            wait([process.sentinel for process, code in zip(processes, codes) if code is None])
+            codes = [process.exitcode for process in processes]
         for process in processes:
             process.join(1)  # what has lost another one ends by itself
         codes = [process.exitcode for process in processes]

@@ -9,6 +9,7 @@ Works without a display through EGL (set MUJOCO_GL yourself for another way, suc
 import copy
 import os
 import sys
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -156,8 +157,8 @@ def main(argv: list[str] | None = None) -> None:
     parser = Parser(__doc__)
     parser.add_argument("checkpoint", type=Path)
     parser.add_argument("--fault", nargs="+", default=["healthy"], help="a row of the strip each; a GIF shows the first")
-    parser.add_argument("--seconds", type=positive, default=4.0, help="of a GIF (default 4)")
-    parser.add_argument("--speed", type=positive, default=0.75, help="commanded, m/s")
+    parser.add_argument("--seconds", type=partial(positive, most=120), default=4.0, help="of a GIF (default 4)")
+    parser.add_argument("--speed", type=partial(positive, most=10), default=0.75, help="commanded, m/s")
     parser.add_argument("--seed", type=seed, default=0)
     parser.add_argument("--stairs", type=int, choices=range(11), metavar="LEVEL", help="0 to 10, instead of flat ground")
     parser.add_argument("--out", type=Path, default=Path("walk.gif"), help="a .gif or .png file")
@@ -176,7 +177,7 @@ def main(argv: list[str] | None = None) -> None:
         else:
             rows = {str(f): film(policy, card["robot"], f, 0.6, 5, 300, 240, **options) for f in faults}
             write_strip(rows, args.out)
-    except (CheckpointError, ValueError, RuntimeError) as error:
+    except (CheckpointError, OSError, FloatingPointError, ValueError, RuntimeError) as error:
         fail(error)
     print(f"written: {args.out}")
 

@@ -123,7 +123,7 @@ class Progress:
         number, returns, lengths, falls = episodes.tolist()
         recent = [x / number if number else math.nan for x in (returns, lengths * CONTROL_DT, falls)]
         row |= dict(zip(("episode_return", "episode_seconds", "falls"), recent))
-        if not self.begun:
+        if not self.begun or not self.path.exists():
             self._begin(",".join(row))
         with open(self.path, "a") as file:
             file.write(",".join(f"{x:.6g}" if isinstance(x, float) else str(x) for x in row.values()) + "\n")
@@ -234,12 +234,12 @@ def train(rank: int, args, sync: str | None, stop: list) -> None:
         (iteration, steps, _), recent, mine = place, saved["recent"].numpy(), saved["processes"][rank]
         policy.load_state_dict(saved["weights"])
         part.critic.load_state_dict(saved["critic"])
-        part.learner.load_state_dict(saved["learner"])
         try:
+            part.learner.load_state_dict(saved["learner"])
             part.env.load_state_dict(from_plain(mine["env"]))
             generator.set_state(mine["generator"])
             torch.set_rng_state(saved["torch"])
-        except (ValueError, IndexError, OverflowError, RuntimeError) as error:  # no random state, no fault of this task
+        except (ValueError, LookupError, OverflowError, RuntimeError) as error:  # e.g. no random state, a fault that is not
             raise CheckpointError(f"the checkpoint in {args.out} does not fit this run: {error}") from error
         part.observation = part.env.observe()
 

@@ -164,6 +164,29 @@ def test_diverged_simulation_is_ended_counted_and_harms_nobody(tmp_path, monkeyp
     assert not list(tmp_path.iterdir()) and capfd.readouterr().err == ""  # counted, not told by MuJoCo in its own way
 
 
+@pytest.mark.parametrize("value", [np.nan, np.inf, 1e4])
+def test_a_state_that_runs_away_in_the_last_substep_is_noticed_at_once(value, monkeypatch):
+    """MuJoCo would warn in the next step, when the numbers are in the buffer, or never."""
+    env, twin = (LocomotionEnv("a1", 3, num_threads=1, config=EnvConfig(push_speed=0.0)) for _ in range(2))
+    env.reset(), twin.reset()
+    step = env.world.step
+
+    def run_away(**how):
+        step(**how)
+        env._qvel[1, 7] = value
+
+    monkeypatch.setattr(env.world, "step", run_away)
+    observation, reward, terminated, _, info = env.step(np.zeros((3, 12)))
+    expected, *_ = twin.step(np.zeros((3, 12)))
+    assert info["diverged"].tolist() == [False, True, False] == terminated.tolist() and env.divergences == 1
+    for x in (*observation, *info["final_observation"], *info["rewards"].values(), reward, info["speed"], info["position"]):
+        assert (np.abs(x) < 1000).all()
+    assert reward[1] == 0 and info["episode_returns"].tolist() == [0]
+    assert np.array_equal(observation.legs[[0, 2]], expected.legs[[0, 2]])
+    monkeypatch.undo()
+    assert not env.step(np.zeros((3, 12)))[4]["diverged"].any()
+
+
 def test_wrong_use_is_refused():
     with pytest.raises(ValueError, match="unknown robot 'a2'; there is a1"):
         LocomotionEnv("a2", 1)

@@ -35,6 +35,16 @@ def weights(run):
     return checkpoint.load(run / "policy.pt")["weights"]
 
 
+def same_run(one, other):
+    """The same checkpoint to the bit (weights, optimiser, simulation, random states), and the same rows but for the times."""
+    a, b = (checkpoint.load(run / "checkpoint.pt") for run in (one, other))
+    assert a["iteration"] == b["iteration"] and checkpoint.misfit(a, b, "") is None
+    for (name, x), (_, y) in zip(checkpoint.numbers(a), checkpoint.numbers(b), strict=True):
+        assert torch.equal(x, y), name
+    tables = [[row | {"collect_seconds": 0, "update_seconds": 0} for row in rows(run / "progress.csv")] for run in (one, other)]
+    assert tables[0] == tables[1] and len(tables[0]) == a["iteration"]
+
+
 def test_train_resume_evaluate(tmp_path, capsys):
     """Two iterations of 192 steps, a third one after a break; the same three in one go end in the same bits."""
     broken, whole = tmp_path / "broken", tmp_path / "whole"
@@ -46,10 +56,7 @@ def test_train_resume_evaluate(tmp_path, capsys):
 
     progress = rows(broken / "progress.csv")
     assert [int(row["steps"]) for row in progress] == [192, 384, 576]
-    timed = ("collect_seconds", "update_seconds", "falls", "episode_return", "episode_seconds")  # the last three: recent episodes
-    for a, b in zip(progress, rows(whole / "progress.csv")):
-        assert {k: v for k, v in a.items() if k not in timed} == {k: v for k, v in b.items() if k not in timed}
-    assert all(torch.equal(a, b) for a, b in zip(weights(broken).values(), weights(whole).values()))
+    same_run(broken, whole)
     fresh = make_policy("rolt", A1).state_dict()
     assert not all(torch.equal(a, b) for a, b in zip(weights(whole).values(), fresh.values()))
     assert (broken / "progress.png").stat().st_size > 1000
@@ -67,18 +74,20 @@ def test_train_resume_evaluate(tmp_path, capsys):
     assert (tmp_path / "once" / "stiffness.png").stat().st_size > 1000
 
 
-def test_two_processes_train_one_policy(tmp_path):
+def test_two_processes_train_one_policy_and_go_on_to_the_bit(tmp_path, capsys):
     """Started as a user does; and again, which must not touch what is there."""
-    command = ["train.py", "--threads", "2", *SMALL, "--steps", "400", "--out", tmp_path / "run"]
-    first = run(*command, cwd=tmp_path)
-    assert first.returncode == 0, first.stderr
-    assert len(rows(tmp_path / "run" / "progress.csv")) == 3
-    before = (tmp_path / "run" / "policy.pt").read_bytes()
-    second = run(*command, cwd=tmp_path)
-    assert second.returncode == 2 and "holds a run already" in second.stderr
-    other = run(*command, "--resume", "--seed", "1", cwd=tmp_path)
-    assert other.returncode == 2 and "seed was 0, is 1" in other.stderr
-    assert (tmp_path / "run" / "policy.pt").read_bytes() == before
+    command = ["train.py", "--threads", "2", *SMALL]
+    for steps, *words in ((192, "--out", "broken"), (400, "--out", "broken", "--resume"), (400, "--out", "whole")):
+        done = run(*command, "--steps", steps, *words, cwd=tmp_path)
+        assert done.returncode == 0 and not done.stderr, done.stderr
+    same_run(tmp_path / "broken", tmp_path / "whole")
+    assert len(rows(tmp_path / "whole" / "progress.csv")) == 3
+    before = (tmp_path / "whole" / "policy.pt").read_bytes()
+    for words, says in (([], "holds a run already"), (["--resume", "--seed", "1"], "seed was 0, is 1")):
+        with pytest.raises(SystemExit) as ended:
+            train.main([*command[1:], "--out", str(tmp_path / "whole"), *words])
+        assert ended.value.code == 2 and says in capsys.readouterr().err
+    assert (tmp_path / "whole" / "policy.pt").read_bytes() == before
 
 
 @pytest.mark.parametrize("policy", ["rma", "roam"])
@@ -100,8 +109,7 @@ def test_a_run_of_several_stages_goes_on_to_the_bit(policy, tmp_path, monkeypatc
         train.main([*common, "--out", str(broken), *resume])
     stages = [row["stage"] for row in rows(whole / "progress.csv")]
     assert stages == (["0"] * 9 + ["1"] if policy == "rma" else ["0"] * 5 + ["1"] * 4 + ["2"])
-    assert [row["stage"] for row in rows(broken / "progress.csv")] == stages
-    assert all(torch.equal(a, b) for a, b in zip(weights(broken).values(), weights(whole).values()))
+    same_run(broken, whole)
     with pytest.raises(SystemExit):
         train.main([*common, "--out", str(whole), "--resume", "--steps", "3840"])
     assert "steps was 1920, is 3840" in capsys.readouterr().err
@@ -169,6 +177,10 @@ def test_damage_test_stands_beside_the_papers(tmp_path, capsys):
         (["train.py", "--steps", "nan"], "not a number"),
         (["train.py", "--steps", "1.5"], "whole number"),
         (["train.py", "--seed", "-1"], "whole number"),
+        (["train.py", "--envs", "1e9"], "at most 65536"),
+        (["train.py", "--threads", "1e6"], "at most"),
+        (["train.py", "--res"], "unrecognized"),
+        (["train.py", "--out", "x" * 5000], "cannot write"),
         (["train.py", "--envs", "7", "--threads", "2"], "do not divide"),
         (["train.py", "--resume", "--out", "nowhere"], "nothing to resume"),
         (["train.py", "--out", "/proc/here"], "cannot write"),
@@ -177,6 +189,9 @@ def test_damage_test_stands_beside_the_papers(tmp_path, capsys):
         (["evaluate.py", "stiffness", "--methods", "magic"], "rolt"),
         (["evaluate.py", "stiffness", "--episodes", "0"], "at least 1"),
         (["evaluate.py", "stiffness", "--seconds", "-1"], "above 0"),
+        (["evaluate.py", "stiffness", "--seconds", "1e308"], "up to 3600"),
+        (["evaluate.py", "stiffness", "--checkpoints", "x" * 5000], "no checkpoint"),
+        (["evaluate.py", "stiffness", "--checkpoints", "nan.pt"], "weights.norm.bias is not finite"),
         (["evaluate.py", "stiffness", "--checkpoints", "missing.pt"], "no checkpoint missing.pt"),
         (["evaluate.py", "stiffness", "--checkpoints", "truncated.pt"], "not a whole checkpoint"),
         (["evaluate.py", "stiffness", "--checkpoints", "text.pt"], "not a whole checkpoint"),
@@ -198,6 +213,7 @@ def test_wrong_input_ends_in_one_line(words, says, tmp_path, capsys, monkeypatch
     checkpoint.save(good, tmp_path / "good.pt")
     checkpoint.save(good | {"robot": "hexapod"}, tmp_path / "other.pt")
     checkpoint.save(good | {"policy": "module-pe"}, tmp_path / "misfit.pt")
+    checkpoint.save(good | {"weights": good["weights"] | {"norm.bias": torch.full((160,), torch.nan)}}, tmp_path / "nan.pt")
     Path("truncated.pt").write_bytes(Path("good.pt").read_bytes()[:100_000])
     Path("text.pt").write_text("not a checkpoint")
     before = sorted(tmp_path.rglob("*"))

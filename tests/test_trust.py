@@ -1,0 +1,158 @@
+"""A run ends well whatever happens, and goes on from nothing but what fits. (tests/stress.py does the same at length.)"""
+
+import os
+import re
+import signal
+import time
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+
+import checkpoint
+import processes
+import train
+
+COMMON = ["--policy", "mlp", "--threads", "1", "--envs", "8", "--minibatches", "2"]
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    """The folder of a run of one iteration, and its checkpoint."""
+    out = tmp_path_factory.mktemp("trained") / "run"
+    train.main([*COMMON, "--steps", "192", "--out", str(out)])
+    return out, checkpoint.load(out / "checkpoint.pt")
+
+
+def resume(trained, content, tmp_path):
+    """Resumes a copy of the run with another checkpoint.pt, for another iteration."""
+    (tmp_path / "progress.csv").write_text((trained[0] / "progress.csv").read_text())
+    checkpoint.save(content, tmp_path / "checkpoint.pt")
+    train.main([*COMMON, "--steps", "384", "--out", str(tmp_path), "--resume"])
+
+
+def changed(content, key, *rest):
+    """A copy of nested dictionaries and lists with one value replaced, or removed if it is `...`."""
+    inner = rest[0] if len(rest) == 1 else changed(content[key], *rest)
+    if isinstance(content, list):
+        return [inner if i == key else item for i, item in enumerate(content)]
+    return {k: v for k, v in content.items() if k != key} | ({} if inner is ... else {key: inner})
+
+
+@pytest.mark.parametrize(
+    "path_and_value, says",
+    [
+        (["identity", ...], "is a policy, not a training"),
+        (["identity", "envs", 16], "envs was 16, is 8"),
+        (["identity", "PPOConfig.clip", "0.1"], "PPOConfig.clip was 0.1, is 0.2"),
+        (["identity", "weight of joint_error", "-1"], "weight of joint_error was -1, is -0.04"),
+        (["iteration", ...], "does not say where"),
+        (["stage", 1], "does not say where"),
+        (["steps", "192"], "does not say where"),
+        (["weights", "decoder.bias", ...], "weights.decoder.bias is missing"),
+        (["weights", "decoder.bias", torch.zeros(13)], r"weights.decoder.bias is \(13,\) torch.float32, not \(12,\)"),
+        (["critic", 3], "critic is not what it should be"),
+        (["learner", "learning_rate", float("nan")], "learner.learning_rate is not finite"),
+        (["learner", "optimizer", "state", 0, "exp_avg", torch.zeros(12).double()], "exp_avg is"),
+        (["learner", "optimizer", "param_groups", 0, "params", 0, 1], "params is"),
+        (["processes", []], "processes is not what it should be"),
+        (["processes", 0, "env", "age", torch.zeros(1, dtype=torch.int64)], r"env.age is \(1,\)"),
+        (["processes", 0, "env", "fault_index", torch.full((8,), 9)], "does not fit this run"),
+        (["processes", 0, "env", "random", "bit_generator", "MT19937"], "does not fit this run"),
+        (["processes", 0, "env", "state", torch.full((8, 1), torch.nan)], "env.state is not finite"),
+    ],
+)
+def test_a_checkpoint_that_does_not_fit_is_refused_by_name(path_and_value, says, trained, tmp_path, capsys):
+    with pytest.raises(SystemExit) as ended:
+        resume(trained, changed(trained[1], *path_and_value), tmp_path)
+    error = capsys.readouterr().err
+    assert ended.value.code == 2 and error.count("\n") == 1 and re.search(says, error), error
+
+
+def test_a_constant_that_an_older_run_did_not_know_is_no_contradiction(trained, tmp_path):
+    older = changed(changed(trained[1], "identity", "PPOConfig.clip", ...), "recent", ...)
+    resume(trained, older, tmp_path)
+    assert checkpoint.load(tmp_path / "checkpoint.pt")["iteration"] == 2
+
+
+@pytest.mark.parametrize(
+    "text, kept",
+    [
+        ("iteration,x\n1,a\n2,b\n3,c\n", ["1,a", "2,b"]),  # 3: after the checkpoint
+        ("iteration,x\n1,a\n2", ["1,a"]),  # torn
+        ("iteration,x\n1,a\n\0\0,\xff\n2,b\n", ["1,a", "2,b"]),
+        ("iteration,y\n1,a\n", []),  # columns of another version
+        ("", []),
+        (None, []),
+    ],
+)
+def test_the_log_goes_on_after_the_checkpoints_row(text, kept, tmp_path):
+    if text is not None:
+        (tmp_path / "progress.csv").write_text(text, encoding="latin-1")
+    progress = train.Progress(SimpleNamespace(out=tmp_path, steps=100), iteration=2, steps=10)
+    progress._begin("iteration,x")
+    assert (tmp_path / "progress.csv").read_text().splitlines() == ["iteration,x", *kept]
+    assert (tmp_path / "progress.previous.csv").exists() == (text is not None and "y" in text)
+
+
+def test_ctrl_c_twice_while_saving_does_no_harm(tmp_path, monkeypatch, capsys):
+    save = checkpoint.save_next
+
+    def interrupted(content, path):
+        signal.raise_signal(signal.SIGINT)
+        save(content, path)
+        signal.raise_signal(signal.SIGTERM)
+
+    monkeypatch.setattr(checkpoint, "save_next", interrupted)
+    before = signal.getsignal(signal.SIGINT)
+    train.main([*COMMON, "--steps", "1920", "--save-minutes", "1e-9", "--out", str(tmp_path)])
+    content = checkpoint.load(tmp_path / "checkpoint.pt")
+    assert content["iteration"] == 2  # the one in which it was pressed, while saving, and the next
+    assert "stopped at 384 steps and saved" in capsys.readouterr().out and signal.getsignal(signal.SIGINT) is before
+
+
+def test_a_full_disk_ends_the_run_in_one_line(trained, tmp_path, monkeypatch, capsys):
+    def full(content, path):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(checkpoint, "save", full)
+    with pytest.raises(SystemExit) as ended:
+        train.main([*COMMON, "--steps", "192", "--out", str(tmp_path)])
+    assert ended.value.code == 1 and capsys.readouterr().err == "error: [Errno 28] No space left on device\n"
+
+
+def ends_badly(rank, args, sync, stop):
+    """Stands in for the training loop: process 1 ends as told, process 0 would wait for it for ever."""
+    if rank == 1:
+        if args.how == "killed":
+            os.kill(os.getpid(), signal.SIGKILL)
+        raise FloatingPointError("the gradient of decoder.bias is not finite")
+    time.sleep(300)
+
+
+@pytest.mark.parametrize("how, code, says", [("killed", 1, "was ended by SIGKILL"), ("diverged", 1, "decoder.bias is not finite")])
+def test_if_a_process_dies_so_do_the_others(how, code, says, tmp_path, capfd):
+    (tmp_path / "checkpoint.pt").touch()
+    started = time.monotonic()
+    with pytest.raises(SystemExit) as ended:
+        processes.run(ends_badly, SimpleNamespace(processes=2, out=tmp_path, how=how))
+    error = capfd.readouterr().err
+    assert ended.value.code == code and time.monotonic() - started < 120
+    assert error.count("\n") == 1 and says in error and "--resume goes on" in error
+
+
+def test_a_diverged_robot_never_reaches_the_buffer(tmp_path, monkeypatch):
+    """Numbers that are not finite, given to a robot in every step of a training: counted, and nothing else."""
+    step = train.LocomotionEnv.step
+
+    def broken(env, action):
+        env._qvel[3, 8] = np.nan
+        return step(env, action)
+
+    monkeypatch.setattr(train.LocomotionEnv, "step", broken)
+    train.main([*COMMON, "--steps", "192", "--out", str(tmp_path)])
+    rows = (tmp_path / "progress.csv").read_text().splitlines()
+    assert dict(zip(rows[0].split(","), rows[1].split(",")))["divergences"] == "48"  # the normalizer's rollout, and the first
+    weights = checkpoint.load(tmp_path / "policy.pt")["weights"].values()
+    assert all(torch.isfinite(x).all() for x in weights)
