@@ -35,6 +35,7 @@ from faults import TASKS
 from ppo import Critic, Learner, PPOConfig, RolloutBuffer, all_reduce, collect, to_tensors
 from robots import ROBOTS
 from rolt import EncoderLayer
+from terrain import TRAINING_MAP, Terrain
 
 try:
     import resource
@@ -60,21 +61,21 @@ def timed(function, times: list[float]):
     return call
 
 
-def make_env(robot: str, num_envs: int, seed: int, threads: int) -> LocomotionEnv:
+def make_env(robot: str, num_envs: int, seed: int, threads: int, **options) -> LocomotionEnv:
     """With the faults of the first task that is for this robot, as train.py has it by default."""
     task = next(task for task in TASKS.values() if robot in task.robots)
-    return LocomotionEnv(robot, num_envs, seed, threads, task.training)
+    return LocomotionEnv(robot, num_envs, seed, threads, task.training, **options)
 
 
 # ---------------------------------------------------------------------- one part at a time
 
 
-def time_simulation(robot: str, num_envs: int, threads: int, steps: int) -> dict[str, float]:
+def time_simulation(robot: str, num_envs: int, threads: int, steps: int, terrain: Terrain | None) -> dict[str, float]:
     """Control steps under random actions."""
-    env = make_env(robot, num_envs, 0, threads)
+    env = make_env(robot, num_envs, 0, threads, terrain=terrain)
     env.reset(random_ages=True)
     total, bare, scan, rng = [], [], [], np.random.default_rng(0)
-    env.world.step, env._scan = timed(env.world.step, bare), timed(env._scan, scan)
+    env.world.step, env.scan.read = timed(env.world.step, bare), timed(env.scan.read, scan)
     step = timed(env.step, total)
     for _ in range(steps + 10):
         if len(total) == 10:  # warm
@@ -248,7 +249,8 @@ def main(argv: list[str] | None = None) -> None:
     report, one = {"ranks": args.threads}, {}
 
     for robot in args.robots:
-        show(robot, time_simulation(robot, args.envs, args.threads, 5 * args.rounds), report)
+        for title, terrain in ((f"{robot} flat", None), (f"{robot} terrain", TRAINING_MAP)):
+            show(title, time_simulation(robot, args.envs, args.threads, 5 * args.rounds, terrain), report)
         for name in args.policies:
             one[robot, name] = time_training(robot, name, args.envs // 4, 0)
             figures = time_learner(robot, name, args.rounds) | time_action(robot, name, 25 * args.rounds)

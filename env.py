@@ -169,9 +169,8 @@ class LocomotionEnv:
         self.command_age = np.zeros(num_envs, dtype=int)  # (N,) steps since the command was drawn
         self.episode_return = np.zeros(num_envs)
         self.divergences = 0  # simulations that were given up, in total
-        self.row = np.zeros(num_envs, dtype=int)  # (N,) of the terrain, on which the episode started
+        self.row, self.start = np.zeros(num_envs, dtype=int), np.zeros((num_envs, 2))  # where on the terrain it began, m
         self.column = np.arange(num_envs) % len(terrain.columns if terrain else "1")
-        self.start = np.zeros((num_envs, 2))  # (N, 2) m
 
     # ------------------------------------------------------------------ interface
 
@@ -315,9 +314,8 @@ class LocomotionEnv:
         self.command[:, 2] = np.clip(0.5 * error, -1.0, 1.0)
 
     def _push(self) -> None:
-        due = self.age % round(self.config.push_seconds / CONTROL_DT) == 0
-        if self.config.push_speed > 0 and due.any():
-            speed = self.config.push_speed
+        due, speed = self.age % round(self.config.push_seconds / CONTROL_DT) == 0, self.config.push_speed
+        if speed > 0 and due.any():
             self._qvel[due, :2] = self.rng.uniform(-speed, speed, size=(int(due.sum()), 2))
 
     def _diverged(self) -> np.ndarray:
