@@ -5,6 +5,8 @@
     python train.py --robot a1 --resume                   # goes on where it was stopped (Ctrl-C is safe)
     python train.py --robot a1 --policy all               # every method of the paper in turn; skips what is finished
     python train.py --robot a1 --paper --device cuda      # the paper's size: 4096 robots, 400 million steps
+    torchrun --nproc-per-node=2 train.py --robot a1 --paper --device cuda    # on two GPUs; on two machines with --nnodes=2
+                                                                             # and a folder that both see as --out
 
 Everything goes to runs/ROBOT-TASK-POLICY-seedN (or --out): policy.pt (for evaluate.py), checkpoint.pt (for --resume),
 progress.csv (a row an iteration) and progress.png.
@@ -169,7 +171,8 @@ class Part:
     """One stage of the training (most methods have one): its robots, buffer, critic and learner."""
 
     def __init__(self, number: int, stage: Stage, args, rank: int, policy: nn.Module, device: torch.device):
-        threads = args.threads if args.device == "cuda" else 1
+        # of the simulation; on a GPU the processes of this machine (torchrun's) share its cores
+        threads = max(1, args.threads // int(os.environ.get("LOCAL_WORLD_SIZE", 1))) if args.device == "cuda" else 1
         share, seeds = args.envs // args.processes, (args.seed, rank, number)
         self.number, self.actor = number, stage.actor
         terrain = TASKS[args.task].terrain
