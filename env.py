@@ -90,7 +90,7 @@ class EnvConfig:
     start_speed: float = 0.5  # m/s and rad/s, each component of the trunk's velocity within +-, legged_gym
     push_seconds: float = 15.0  # legged_gym: then the trunk's velocity is redrawn
     push_speed: float = 1.0  # m/s, x and y within +-, legged_gym; 0 = no pushes
-    start_rows: int = 3  # of the terrain, on which robots begin, ours: the easier half (legged_gym: 6 of 10)
+    start_rows: int = 3  # of the terrain, on which robots begin, ours (legged_gym: 6 of 10)
     climb: bool = True  # from row to row by the curriculum; False = always start on the first rows
 
 

@@ -160,7 +160,7 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--seconds", type=partial(positive, most=120), default=4.0, help="of a GIF (default 4)")
     parser.add_argument("--speed", type=partial(positive, most=10), default=0.75, help="commanded, m/s")
     parser.add_argument("--seed", type=seed, default=0)
-    parser.add_argument("--stairs", type=int, choices=range(11), metavar="LEVEL", help="0 to 10, instead of flat ground")
+    parser.add_argument("--stairs", type=int, choices=range(-2, 11), metavar="LEVEL", help="-2 to 10, instead of flat ground")
     parser.add_argument("--out", type=Path, default=Path("walk.gif"), help="a .gif or .png file")
     args = parser.parse_args(argv)
     if args.out.suffix not in (".gif", ".png"):

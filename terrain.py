@@ -8,7 +8,8 @@ square with a flat strip around it; robots start on the strip in front of it and
     stairs      a pyramid of 6 steps
     platforms   5 x 5 blocks of random height
 
-Heights grow with the level (legged_gym's formulas; its level 10 is difficulty 1). Unlike legged_gym's, the ground is not
+Heights grow with the level (legged_gym's formulas, of which level 0 is the easiest and 10 the hardest; -1 and -2 are ours,
+for a policy that comes from flat ground and hardly lifts its feet). Unlike legged_gym's, the ground is not
 a height field but boxes and convex meshes: a height field costs four times as much to collide with, and its steps are
 never quite vertical. All coordinates in metres. Walking robots climb the levels as in legged_gym (`next_row`).
 
@@ -40,7 +41,7 @@ def rise(level: int) -> float:
 
 def gradient(level: int) -> float:
     """Height over run of a slope, legged_gym."""
-    return 0.04 * level
+    return 0.04 * max(0, level)
 
 
 def block_height(level: int) -> float:
@@ -53,13 +54,13 @@ class Terrain:
     """Tile (row, column) covers x from 8 row to 8 row + 8 and y from 8 column - 4 to 8 column + 4. All around is flat."""
 
     columns: tuple[str, ...]  # of KINDS
-    levels: tuple[int, ...]  # of each row, 0 (easy) to 10
+    levels: tuple[int, ...]  # of each row, -2 (easy) to 10
 
     def __post_init__(self):
         if unknown := set(self.columns) - set(KINDS):
             raise ValueError(f"unknown kind of terrain {', '.join(sorted(unknown))}; there is {', '.join(KINDS)}")
-        if not self.columns or not self.levels or not all(0 <= level <= 10 for level in self.levels):
-            raise ValueError(f"a terrain has columns, and rows of level 0 to 10, not {self.columns} and {self.levels}")
+        if not self.columns or not self.levels or not all(-2 <= level <= 10 for level in self.levels):
+            raise ValueError(f"a terrain has columns, and rows of level -2 to 10, not {self.columns} and {self.levels}")
 
     @cached_property
     def blocks(self) -> np.ndarray:
@@ -125,9 +126,9 @@ class Terrain:
         return np.where(finished, rng.integers(len(self.levels), size=len(row)), row)
 
 
-# Two fifths of the robots learn on stairs, where the tests are. Six levels (ours, of legged_gym's ten): steps of 5 to 14 cm
-# for a robot that stands 30 cm high.
-TRAINING_MAP = Terrain(columns=("stairs", "slope", "stairs", "platforms", "flat"), levels=(0, 1, 2, 3, 4, 5))
+# Two fifths of the robots learn on stairs, where the tests are. Steps of 1.4 to 12.2 cm for a robot that stands 30 cm high;
+# a run that began at level 0 (5 cm) learned to stand in front of the stairs.
+TRAINING_MAP = Terrain(columns=("stairs", "slope", "stairs", "platforms", "flat"), levels=(-2, -1, 0, 1, 2, 3, 4))
 
 _SOLID = {"contype": 1, "conaffinity": 0}  # collides with robots, as the ground does
 _SHADES = [0.80, 0.77, 0.72, 1], [0.55, 0.53, 0.50, 1]  # one step from the next
