@@ -45,11 +45,14 @@ def guarded(train, rank: int, args, sync: str | None = None, told=None) -> None:
     except (OSError, FloatingPointError) as error:
         code, says = 1, f"{error}{last_saved(args)}"
     except (MemoryError, RuntimeError) as error:
-        if told is not None and "gloo" in str(error):  # another process has ended
+        if "gloo" in str(error) and told is not None:  # another process has ended, and the one that started us says so
             os._exit(LOST)
-        if not isinstance(error, MemoryError) and "allocate" not in str(error):  # torch's word for too little memory
+        if "gloo" in str(error):
+            code, says = LOST, f"another process of this run has ended{last_saved(args)}"
+        elif isinstance(error, MemoryError) or "allocate" in str(error):  # torch's word for too little memory
+            code, says = 1, f"there is not enough memory for {args.envs} robots: choose fewer with --envs"
+        else:
             raise
-        code, says = 1, f"there is not enough memory for {args.envs} robots: choose fewer with --envs"
     finally:
         if told is None:
             for number, handler in former.items():
