@@ -156,8 +156,7 @@ class LocomotionEnv:
         self._angle_at, self._velocity_at = self.model.jnt_qposadr[self._joints], self.model.jnt_dofadr[self._joints]
         self.faults = [fault for _, fault in faults]
         self._fault_odds = np.array([probability for probability, _ in faults])
-        self._pinned = False
-        self.fault_index = np.zeros(num_envs, dtype=int)  # (N,) which of `faults` each robot has
+        self._pinned, self.fault_index = False, np.zeros(num_envs, dtype=int)  # (N,) which of `faults` each robot has
 
         shape = (num_envs, self.num_legs, self.num_joints)
         self.action, self.last_action = np.zeros(shape), np.zeros(shape)
@@ -165,8 +164,7 @@ class LocomotionEnv:
         self.history = np.zeros((num_envs, self.num_legs, memory, 12 + 3 * self.num_joints), dtype=np.float32)
         self.command, self.heading = np.zeros((num_envs, 3)), np.zeros(num_envs)
         self.air_time, self._last_contact = np.zeros(shape[:2]), np.zeros(shape[:2], dtype=bool)
-        self.age = np.zeros(num_envs, dtype=int)  # (N,) steps since reset
-        self.command_age = np.zeros(num_envs, dtype=int)  # (N,) steps since the command was drawn
+        self.age, self.command_age = np.zeros((2, num_envs), dtype=int)  # (N,) steps since the reset, since the command
         self.episode_return = np.zeros(num_envs)
         self.divergences = 0  # simulations that were given up, in total
         self.row, self.start = np.zeros(num_envs, dtype=int), np.zeros((num_envs, 2))  # where on the terrain it began, m
@@ -185,8 +183,7 @@ class LocomotionEnv:
         everyone = np.arange(self.num_envs)
         self._resample_commands(everyone)
         if self.terrain:
-            rows = min(self.config.start_rows, len(self.terrain.levels))
-            self.row[:] = self.rng.integers(rows, size=self.num_envs)
+            self.row[:] = self.rng.integers(min(self.config.start_rows, len(self.terrain.levels)), size=self.num_envs)
         self._reset(everyone)
         if random_ages:
             self.age[:] = self.rng.integers(self.episode_steps, size=self.num_envs)
