@@ -162,7 +162,7 @@ def browser(show: Show, port: int = 0) -> None:
         @messages.handler
         def draw(self, _: messages.BuildGuiEvent) -> None:
             imgui.SetNextWindowPos(imgui.Vec2(20, 20), imgui.Cond.FirstUseEver)
-            imgui.SetNextWindowSize(imgui.Vec2(420, 170), imgui.Cond.FirstUseEver)
+            imgui.SetNextWindowSize(imgui.Vec2(360, 160), imgui.Cond.FirstUseEver)
             if imgui.Begin("Walk")[0]:
                 imgui.TextUnformatted(show.said)
                 moved, speed = imgui.SliderFloat("m/s", show.speed, 0.0, 1.0, "%.2f")
