@@ -132,7 +132,9 @@ def desktop(show: Show) -> None:
     while not (show.over or closed):
         model, data = show.model, show.data
         with mujoco.viewer.launch_passive(model, data, key_callback=key, show_left_ui=False, show_right_ui=False) as viewer:
-            track(viewer.cam)
+            viewer.sync()  # a camera that is set before the first one is set back
+            with viewer.lock():
+                track(viewer.cam)
             while show.data is data and not (show.over or closed):
                 with viewer.lock():
                     show.step()
