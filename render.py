@@ -135,7 +135,7 @@ def film(
 def write_gif(frames: list[np.ndarray], path: Path, seconds_a_frame: float) -> None:
     """One palette for all frames keeps the file small and the colours still."""
     images = [Image.fromarray(frame) for frame in frames]
-    palette = images[0].quantize(64)
+    palette = images[0].quantize(64, Image.Quantize.FASTOCTREE)  # keeps the few red pixels of a fault red
     images = [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images]
     duration = max(20, round(1000 * seconds_a_frame))
     images[0].save(path, save_all=True, append_images=images[1:], duration=duration, loop=0, optimize=True)

@@ -132,7 +132,9 @@ def desktop(show: Show) -> None:
     while not (show.over or closed):
         model, data = show.model, show.data
         with mujoco.viewer.launch_passive(model, data, key_callback=key, show_left_ui=False, show_right_ui=False) as viewer:
-            track(viewer.cam)
+            viewer.sync()  # a camera that is set before the first one is set back
+            with viewer.lock():
+                track(viewer.cam)
             while show.data is data and not (show.over or closed):
                 with viewer.lock():
                     show.step()
@@ -162,7 +164,7 @@ def browser(show: Show, port: int = 0) -> None:
         @messages.handler
         def draw(self, _: messages.BuildGuiEvent) -> None:
             imgui.SetNextWindowPos(imgui.Vec2(20, 20), imgui.Cond.FirstUseEver)
-            imgui.SetNextWindowSize(imgui.Vec2(420, 170), imgui.Cond.FirstUseEver)
+            imgui.SetNextWindowSize(imgui.Vec2(360, 160), imgui.Cond.FirstUseEver)
             if imgui.Begin("Walk")[0]:
                 imgui.TextUnformatted(show.said)
                 moved, speed = imgui.SliderFloat("m/s", show.speed, 0.0, 1.0, "%.2f")

@@ -53,7 +53,9 @@ def test_speed_again_and_quit(show):
     assert show.over
 
 
-@pytest.mark.parametrize("wish, says", [("melt:FR", "lock:FR_calf"), ("lock:MR_calf", "no joint"), ("tow:MR", "no leg MR"), ("-1", "-1")])
+@pytest.mark.parametrize(
+    "wish, says", [("melt:FR", "lock:FR_calf"), ("lock:MR_calf", "no joint"), ("tow:MR", "no leg MR"), ("-1", "-1")]
+)
 def test_a_wish_that_cannot_be_read_changes_nothing(show, wish, says):
     show.obey("lock:RL_calf")
     show.obey(wish)
