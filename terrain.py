@@ -153,7 +153,7 @@ def _add_frustum(spec: mujoco.MjSpec, x: float, y: float, top: float, name: str)
 def main() -> None:
     from plots import ground_map  # not above: nothing else here draws
 
-    x, y = np.arange(-1, 50, 0.05), np.arange(-5, 38, 0.05)
+    x, y = np.arange(-1, 58, 0.05), np.arange(-5, 38, 0.05)
     height = TRAINING_MAP.height(*np.meshgrid(x, y, indexing="ij"))
     title = "The training map: " + ", ".join(TRAINING_MAP.columns) + " (from right to left)"
     ground_map(height, (x[0], x[-1], y[0], y[-1]), Path(__file__).parent / "results" / "terrain.png", title)
