@@ -35,8 +35,30 @@ class ScanNoise:
     def __post_init__(self):
         if not (0 <= self.offset_patches <= NUM_PATCHES and 0 <= self.missing_patches <= NUM_PATCHES):
             raise ValueError(f"0 to {NUM_PATCHES} patches can be offset or missing")
-        if min(self.offset, self.sigma) < 0:
-            raise ValueError("the scale of noise is not negative")
+        if not (0 <= self.offset < np.inf and 0 <= self.sigma < np.inf):
+            raise ValueError("the scale of noise is a number from 0 on")
+
+
+def parse(text: str) -> ScanNoise:
+    """Reads 'clean', 'offset:METRES', 'sigma:METRES', 'missing:PATCHES', or several joined with '+'.
+
+    Raises ValueError with what would be right.
+    """
+    values = {}
+    try:
+        for word in text.split("+"):
+            match word.split(":"):
+                case ["clean"]:
+                    pass
+                case ["offset" | "sigma" as name, metres]:
+                    values[name] = float(metres)
+                case ["missing", patches]:
+                    values["missing_patches"] = int(patches)
+                case _:
+                    raise ValueError("no such kind of noise")
+        return ScanNoise(**values)
+    except ValueError as error:
+        raise ValueError(f"cannot read the noise {text!r} ({error}); write clean, offset:0.3, sigma:0.1 or missing:4") from None
 
 
 def spread(patches: np.ndarray) -> np.ndarray:
@@ -75,6 +97,12 @@ class NoisyScan:
         self.terrain, self.noise, self.rng = terrain, noise, np.random.default_rng(seed)
         self.shift = np.zeros((num_envs, *SCAN_SHAPE, 3))  # m, of the patches
         self.missing = np.zeros((num_envs, *SCAN_SHAPE), dtype=bool)
+
+    def set_noise(self, noise: ScanNoise) -> None:
+        """From the next reading on."""
+        self.noise = noise
+        self.shift[:], self.missing[:] = 0.0, False
+        self.draw(np.arange(len(self.shift)))
 
     def draw(self, ids: np.ndarray) -> None:
         """Patches and directions anew for the robots `ids`: at a reset, or before every reading (`ScanNoise.redraw`)."""

@@ -65,15 +65,17 @@ class Walk(NamedTuple):
 
 @torch.no_grad()
 def record(
-    policy, robot: str, faults: list[Fault], seconds: float, speed: float = 0.75, seed: int = 0, threads: int = 1,
-    terrain: Terrain | None = None,
-) -> Walk:  # fmt: skip
-    """One robot a fault walks straight on at `speed` until all have fallen or the time is up. Nobody is pushed."""
+    policy, robot: str, faults: list[Fault], seconds: float, speed: float = 0.75, seed: int = 0, threads: int = 1, **env_options
+) -> Walk:
+    """One robot a fault walks straight on at `speed` until all have fallen or the time is up. Nobody is pushed.
+
+    env_options: of LocomotionEnv, such as terrain and noise.
+    """
     config = EnvConfig(
         forward_speed=(speed, speed), heading=(0.0, 0.0), push_speed=0.0, episode_seconds=seconds + 1.0, start_rows=1
     )
     situations = [(1.0, fault) for fault in faults]
-    env = LocomotionEnv(robot, len(faults), seed, threads, situations, config, policy.extras, terrain)
+    env = LocomotionEnv(robot, len(faults), seed, threads, situations, config, policy.extras, **env_options)
     env.pin_faults(faults)  # one each
     observation, poses, contacts = env.reset(), [], []
     feet = [env.model.sensor(f"contact_{leg}_foot").adr[0] for leg in env.robot.legs]
@@ -121,11 +123,11 @@ def draw(walk: Walk, robot: int, steps: range, width: int = 480, height: int = 3
 
 def film(
     policy, robot: str, fault: Fault, seconds: float, every: int, width: int = 480, height: int = 300,
-    speed: float = 0.75, seed: int = 0, warm_up: float = 2.0, terrain: Terrain | None = None,
+    speed: float = 0.75, seed: int = 0, warm_up: float = 2.0, **env_options,
 ) -> list[np.ndarray]:  # fmt: skip
     """Frames of one robot that walks straight on, one each `every` control steps, after `warm_up` seconds. The film ends
     where the robot falls."""
-    walk = record(policy, robot, [fault], warm_up + seconds, speed, seed, terrain=terrain)
+    walk = record(policy, robot, [fault], warm_up + seconds, speed, seed, **env_options)
     steps = range(round(warm_up / CONTROL_DT), walk.steps[0], every)
     if not steps:
         raise ValueError(f"with {fault} the robot falls within {warm_up:g} s: there is nothing to show")

@@ -99,6 +99,8 @@ def build_model(
     """
     if unknown := {*towing, *skating} - set(robot.legs):
         raise ValueError(f"the {robot.name} has no leg {', '.join(sorted(unknown))}; it has {', '.join(robot.legs)}")
+    if terrain is not None and towing:
+        raise ValueError("the box wants flat ground: no terrain for robots that tow")
     spec = mujoco.MjSpec()
     spec.modelname = robot.name
     spec.compiler.degree = False

@@ -1,13 +1,15 @@
-"""A trained policy to look at while it walks, with its fault and its command to change on the way.
+"""A trained policy to look at while it walks, with its fault, its command and its noise to change on the way.
 
     python evaluate.py watch                                          # the A1, healthy
     python evaluate.py watch --robot a1 --fault lock:FR_calf --speed 0.5
+    python evaluate.py watch --stairs 0 --noise offset:0.2            # steps of 5 cm (level 0), and scandots that lie
     python evaluate.py watch --fault tow:RR --video tow.gif           # no viewer, a moving picture
 
 Where there is a display, a window of MuJoCo's viewer opens: the keys up and down change the speed, left and right the
 fault. Elsewhere MuJoCo's browser viewer is served; its panel does the same. (It is open to everybody who can reach the
 port; from another machine it wants `ssh -L 8080:localhost:8080`.) Either way the terminal takes the same words: a fault
-("lock:RL_calf", "healthy"), a speed ("0.5"), "again" to start over, "quit". A robot that falls starts over by itself.
+("lock:RL_calf", "healthy"), a speed ("0.5"), noise ("sigma:0.1", "clean"), "again" to start over, "quit". A robot that
+falls starts over by itself.
 """
 
 import os
@@ -26,18 +28,25 @@ from checkpoint import CheckpointError, load_policy
 from cli import Parser, fail, positive, seed, writable_folder
 from env import CONTROL_DT, EnvConfig, LocomotionEnv
 from faults import REAL_WORLD, TASKS, Fault, healthy, parse, props, write_fault
+from noise import ScanNoise
+from noise import parse as parse_noise
 from ppo import to_tensors
 from robots import ROBOTS
+from terrain import Terrain
 
-HELP = "type a fault (lock:RL_calf, healthy, ...), a speed (0.5), again or quit"
+HELP = "type a fault (lock:RL_calf, healthy, ...), a speed (0.5), noise (sigma:0.1, clean, ...), again or quit"
 
 
 class Show:
     """One robot that walks straight on for ever. `model` and `data` are what a viewer shows; they are new objects after some
     changes. `said` is the answer to the last wish."""
 
-    def __init__(self, policy, robot: str, fault: Fault = healthy(), speed: float = 0.75, seed: int = 0):
+    def __init__(
+        self, policy, robot: str, fault: Fault = healthy(), speed: float = 0.75, seed: int = 0,
+        terrain: Terrain | None = None, noise: ScanNoise = ScanNoise(),
+    ):  # fmt: skip
         self.policy, self.robot, self.fault, self.speed, self.seed = policy, robot, fault, speed, seed
+        self.terrain, self.noise = terrain, noise
         task = next(task for task in TASKS.values() if robot in task.robots)
         self.menu = [fault for _, fault in task.training] + list(task.unseen)
         self.menu += REAL_WORLD.values() if "go1" in task.robots else ()
@@ -46,8 +55,9 @@ class Show:
 
     def start(self) -> None:
         """A new episode in a new env."""
-        config = EnvConfig(lateral_speed=(0.0, 0.0), heading=(0.0, 0.0), push_speed=0.0, episode_seconds=3600)
-        self.env = LocomotionEnv(self.robot, 1, self.seed, 1, [(1.0, self.fault)], config, self.policy.extras)
+        config = EnvConfig(heading=(0.0, 0.0), push_speed=0.0, episode_seconds=3600, start_rows=1, climb=False)
+        options = {"config": config, "extras": self.policy.extras, "terrain": self.terrain, "noise": self.noise}
+        self.env = LocomotionEnv(self.robot, 1, self.seed, 1, [(1.0, self.fault)], **options)
         self.observation = self.env.reset()
         self.model = render.painted(self.env, self.fault)
         self.data = mujoco.MjData(self.model)
@@ -75,6 +85,9 @@ class Show:
                 self.start()
             elif wish.replace(".", "", 1).isdecimal():
                 self.speed = float(wish)
+            elif wish.split(":")[0] in ("clean", "offset", "sigma", "missing"):
+                self.noise = parse_noise(wish)
+                self.env.scan.set_noise(self.noise)
             elif wish:
                 self.set_fault(parse(wish))
             self.said = f"{self.fault}, {self.speed:g} m/s"
@@ -200,29 +213,31 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--checkpoint", type=Path, metavar="FILE", help="default: the shipped ROLT of the robot")
     parser.add_argument("--fault", default="healthy", help="e.g. lock:FR_calf+weaken:RL:0.5 (default healthy)")
     parser.add_argument("--speed", type=positive, default=0.75, help="commanded, m/s (default 0.75)")
+    parser.add_argument("--stairs", type=int, choices=range(-2, 11), metavar="LEVEL", help="-2 to 10, instead of flat ground")
+    parser.add_argument("--noise", default="clean", help="on the scandots, e.g. offset:0.2, sigma:0.1, missing:4")
     parser.add_argument("--seed", type=seed, default=0)
     parser.add_argument("--viewer", choices=("desktop", "browser"), help="default: desktop where there is a display")
     parser.add_argument("--port", type=int, default=0, help="of the browser viewer (default: the first free from 8080 on)")
     parser.add_argument("--video", type=Path, metavar="FILE.gif", help="write a moving picture instead")
     parser.add_argument("--seconds", type=positive, default=4.0, help="of the moving picture (default 4)")
     args = parser.parse_args(argv)
-    task = next(name for name, task in TASKS.items() if args.robot in task.robots)
+    task = next(name for name, task in TASKS.items() if args.robot in task.robots) if args.stairs is None else "terrain"
     shipped = Path(os.path.relpath(Path(__file__).parent / "checkpoints")) / f"{args.robot}-{task}-rolt.pt"
     if args.video and args.video.suffix != ".gif":
         fail(f"--video is a .gif file, not {args.video}")
     torch.set_num_threads(1)
     try:
         policy, _ = load_policy(args.checkpoint or shipped, args.robot)
-        fault = parse(args.fault)
+        fault, noise = parse(args.fault), parse_noise(args.noise)
+        terrain = None if args.stairs is None else Terrain(("stairs",), (args.stairs,) * 9)
         if args.video:
             writable_folder(args.video.parent)
-            render.write_gif(
-                render.film(policy, args.robot, fault, args.seconds, 2, speed=args.speed, seed=args.seed), args.video,
-                2 * CONTROL_DT,
-            )  # fmt: skip
+            options = {"speed": args.speed, "seed": args.seed, "terrain": terrain, "noise": noise}
+            frames = render.film(policy, args.robot, fault, args.seconds, 2, **options)
+            render.write_gif(frames, args.video, 2 * CONTROL_DT)
             print(f"written: {args.video}")
             return
-        show = Show(policy, args.robot, fault, args.speed, args.seed)
+        show = Show(policy, args.robot, fault, args.speed, args.seed, terrain, noise)
         print(HELP)
         listen(show)
         kind = args.viewer or ("desktop" if has_display() else "browser")

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from env import EnvConfig, LocomotionEnv
-from noise import NoisyScan, ScanNoise, missing_points, patch_shifts, point_shifts
+from noise import NoisyScan, ScanNoise, missing_points, parse, patch_shifts, point_shifts
 from robots import A1, build_model
 from rolt import ROLT
 from scandots import scan
@@ -76,6 +76,14 @@ def test_noise_of_scale_zero_is_none_to_the_bit():
     clean = NoisyScan(1, STAIRS, ScanNoise(), 0).read(np.arange(1), position, yaw)
     zero = NoisyScan(1, STAIRS, ScanNoise(offset=0.0, sigma=0.0, redraw=True), 0).read(np.arange(1), position, yaw)
     assert np.array_equal(clean, zero)
+
+
+def test_noise_is_read_from_words():
+    assert parse("clean") == ScanNoise()
+    assert parse("offset:0.3+missing:4+sigma:0.1") == ScanNoise(offset=0.3, missing_patches=4, sigma=0.1)
+    for text in ("fog", "sigma", "sigma:-1", "sigma:nan", "missing:13", "missing:1.5", ""):
+        with pytest.raises(ValueError, match="write clean, offset:0.3"):
+            parse(text)
 
 
 def test_low_frequency_noise_moves_whole_patches_by_its_scale():

@@ -53,8 +53,21 @@ def test_speed_again_and_quit(show):
     assert show.over
 
 
+def test_noise_changes_while_it_walks(show):
+    show.obey("missing:12")
+    show.step()
+    assert (show.observation.heights == 0).all() and show.said == "healthy, 0.75 m/s"
+    show.obey("clean")
+    show.step()
+    assert (show.observation.heights != 0).all()
+
+
 @pytest.mark.parametrize(
-    "wish, says", [("melt:FR", "lock:FR_calf"), ("lock:MR_calf", "no joint"), ("tow:MR", "no leg MR"), ("-1", "-1")]
+    "wish, says",
+    [
+        ("melt:FR", "lock:FR_calf"), ("lock:MR_calf", "no joint"), ("tow:MR", "no leg MR"), ("-1", "-1"),
+        ("sigma:-1", "write clean, offset"),
+    ],  # fmt: skip
 )
 def test_a_wish_that_cannot_be_read_changes_nothing(show, wish, says):
     show.obey("lock:RL_calf")
