@@ -23,12 +23,13 @@ import torch
 from torch import Tensor, nn
 from torch.utils.benchmark import Timer
 
-from env import HISTORY, SCAN_SHAPE, LocomotionEnv, Observation
+from env import HISTORY, LocomotionEnv, Observation
 from faults import TASKS, Fault, Task
 from normalizer import Normalizer
 from ppo import Learner, PPOConfig, to_tensors
 from robots import ROBOTS, Robot
 from rolt import ROLT, SIGMA_BOUNDS, Masks, ROLTConfig, drop
+from scandots import SCAN_SHAPE
 
 HIDDEN = (512, 256, 128)  # legged_gym
 INITIAL_SIGMA = ROLTConfig.initial_sigma  # the same exploration for every method

@@ -17,6 +17,7 @@ import torch
 
 from baselines import METHODS, make_policy
 from faults import TASKS
+from normalizer import Normalizer
 from robots import ROBOTS
 
 FORMAT = 1  # raise it when files of before can no longer be read
@@ -141,3 +142,26 @@ def load_policy(path: str | Path, robot: str | None = None) -> tuple[torch.nn.Mo
         raise CheckpointError(f"the weights in {path} do not fit the policy {card['policy']} ({why}): train it again")
     policy.load_state_dict(content["weights"])
     return policy.eval(), card
+
+
+def start_from(path: str | Path, robot: str, policy: torch.nn.Module, critic: torch.nn.Module | None = None) -> None:
+    """Puts the weights in the file into a fresh policy and, if it is a checkpoint.pt, into a fresh critic.
+
+    The file may be of another method whose weights include all of the policy's (ROLT's fit the ablations of its dropout).
+    What the normalizers measured is kept until the first rollout of the new run replaces it.
+    CheckpointError if the file cannot be used.
+    """
+    content = load(path)
+    if content.get("robot") != robot:
+        raise CheckpointError(f"{path} was trained on the {content.get('robot')}, not on the {robot}")
+    try:
+        missing, _ = policy.load_state_dict(content["weights"], strict=False)
+        if missing:
+            raise KeyError(missing[0])
+        if critic is not None and content.get("critic"):  # a finished RMA or ROAM has none
+            critic.load_state_dict(content["critic"])
+    except (RuntimeError, TypeError, AttributeError, KeyError) as error:
+        raise CheckpointError(f"the weights in {path} do not fit this policy: start from one of its own") from error
+    for module in policy.modules():
+        if isinstance(module, Normalizer):
+            module.count.zero_()

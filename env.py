@@ -1,7 +1,8 @@
 """N legged robots in MuJoCo, each with a fault of its own, behind the interface of a Gymnasium vector env.
 
 The simulator is `mujoco.batch.Batch`; this file adds what the paper's section III and legged_gym define around it:
-observations, commands, resets, pushes, terminations. Rewards are in rewards.py, faults in faults.py.
+observations, commands, resets, pushes, terminations. Rewards are in rewards.py, faults in faults.py, the ground in
+terrain.py, the scandots in scandots.py, their noise in noise.py.
 
 Legend: N robots, L legs, J joints a leg, H = 10 steps of history. Numpy, float32 out.
 
@@ -17,9 +18,7 @@ What a policy sees (`Observation`); scales are legged_gym's:
       15:18                     trunk angular velocity in the trunk's frame [rad/s]                0.25
       18:21                     direction of gravity in the trunk's frame                          1
     action     (N, L*J)         a_{t-1} of eq. 2, the previous target angles of all joints [rad]   1
-    heights    (N, 16, 12)      s_e: clip(trunk z - 0.5 m - ground z, -1, 1) at points 0.1 m       5
-                                apart around the robot, rows forward, columns left, turning with
-                                its yaw (the ground is flat so far)
+    heights    (N, 16, 12)      s_e: clip(trunk z - 0.5 m - ground z, -1, 1) at the scandots       5
 
 Angles are absolute, as the paper writes ("joints' position", "the last output target angles"; legged_gym subtracts the
 default pose). The default pose differs a little from leg to leg (the A1's hips are turned outwards, to -0.1 right and
@@ -50,9 +49,11 @@ import mujoco
 import numpy as np
 from mujoco.batch import Batch
 
-from faults import Fault, healthy, write_fault
+from faults import Fault, healthy, props, write_fault
+from noise import NoisyScan, ScanNoise
 from rewards import FALL, total_reward
 from robots import PHYSICS_DT, ROBOTS, Robot, build_model
+from terrain import Terrain
 
 mujoco.set_mju_user_warning(lambda message: None)  # divergences are counted below; not on stderr and in MUJOCO_LOG.TXT
 
@@ -61,14 +62,12 @@ CONTROL_DT = SUBSTEPS * PHYSICS_DT  # s
 HISTORY = 10  # steps (paper, section III-A)
 LONG_HISTORY = 50  # steps that RMA's adaptation reads (Kumar et al. 2021)
 EXTRAS = ("privileged", "past", "situation")
-HEIGHT_SCALE = 5.0  # legged_gym
-SCAN_SHAPE = (16, 12)  # points forward, left; 12 patches of 4 x 4 (the paper gives 12 patches, the points are ours)
 MAX_ACTION = 10.0  # ours: 2.5 rad from the default pose reaches every joint limit
 MAX_SPEED = 1000.0  # m/s and rad/s, ours: flailing at the motors' limits reaches 100; beyond is a simulation that ran away
 MAX_TILT = np.cos(np.deg2rad(60))  # ours: past 60 degrees no robot here gets up again; legged_gym waits for contact
 SAVED_ARRAYS = (
     "action", "last_action", "history", "command", "heading", "air_time", "age", "command_age", "episode_return", "fault_index",
-    "_last_contact",
+    "_last_contact", "row", "start",
 )  # fmt: skip
 
 
@@ -91,6 +90,8 @@ class EnvConfig:
     start_speed: float = 0.5  # m/s and rad/s, each component of the trunk's velocity within +-, legged_gym
     push_seconds: float = 15.0  # legged_gym: then the trunk's velocity is redrawn
     push_speed: float = 1.0  # m/s, x and y within +-, legged_gym; 0 = no pushes
+    start_rows: int = 3  # of the terrain, on which robots begin, ours: the easier half (legged_gym: 6 of 10)
+    climb: bool = True  # from row to row by the curriculum; False = always start on the first rows
 
 
 class Observation(NamedTuple):
@@ -107,9 +108,12 @@ class Observation(NamedTuple):
 class LocomotionEnv:
     """N robots of one kind; robot i's episode ends, and is restarted by `step`, on its own.
 
-    faults: (probability, fault) pairs; each reset draws one. `pin_faults` fixes one a robot instead.
+    faults: (probability, fault) pairs; each reset draws one. `pin_faults` fixes one a robot instead. Boxes and skates
+        are there only if one of `faults` needs them.
     num_threads: of the simulator, 0 = one a core. Results do not depend on it.
     extras: which of privileged, past and situation the observation holds. None of them changes the simulation.
+    terrain: None = flat ground. Robot i stays on column i modulo the number of columns.
+    noise: on the scandots, for tests; from a generator of its own, so that it changes nothing else.
     """
 
     def __init__(
@@ -121,6 +125,8 @@ class LocomotionEnv:
         faults: tuple[tuple[float, Fault], ...] = ((1.0, healthy()),),
         config: EnvConfig = EnvConfig(),
         extras: tuple[str, ...] = (),
+        terrain: Terrain | None = None,
+        noise: ScanNoise = ScanNoise(),
     ):
         if isinstance(robot, str) and robot not in ROBOTS:
             raise ValueError(f"unknown robot {robot!r}; there is {', '.join(ROBOTS)}")
@@ -134,8 +140,8 @@ class LocomotionEnv:
         self.num_actions = self.num_legs * self.num_joints
         self.episode_steps = round(config.episode_seconds / CONTROL_DT)
         self.rng = np.random.default_rng(seed)
-
-        self.model = build_model(robot)
+        self.terrain, self.scan = terrain, NoisyScan(num_envs, terrain, noise, seed)
+        self.model = build_model(robot, terrain, **props([fault for _, fault in faults]))
         self.world = Batch(self.model, nsim=num_envs, nthread=num_threads, persistent=True)
         self._qpos, self._qvel, self._ctrl = (self.world.bind(name) for name in ("qpos", "qvel", "ctrl"))
         self._torque, self._contacts = self.world.bind("actuator_force"), self.world.bind("sensordata")
@@ -146,7 +152,8 @@ class LocomotionEnv:
         self._link_sensors = [i for i, name in enumerate(names) if name in robot.joints]
 
         self._default = np.array(robot.default_pose)  # (L, J)
-        self._limits = np.array([link.limits for link in robot.links])  # (J, 2)
+        self._joints = np.array([self.model.joint(name).id for name in robot.joints])  # (L*J,) ids, without wheels
+        self._angle_at, self._velocity_at = self.model.jnt_qposadr[self._joints], self.model.jnt_dofadr[self._joints]
         self.faults = [fault for _, fault in faults]
         self._fault_odds = np.array([probability for probability, _ in faults])
         self._pinned = False
@@ -162,6 +169,9 @@ class LocomotionEnv:
         self.command_age = np.zeros(num_envs, dtype=int)  # (N,) steps since the command was drawn
         self.episode_return = np.zeros(num_envs)
         self.divergences = 0  # simulations that were given up, in total
+        self.row = np.zeros(num_envs, dtype=int)  # (N,) of the terrain, on which the episode started
+        self.column = np.arange(num_envs) % len(terrain.columns if terrain else "1")
+        self.start = np.zeros((num_envs, 2))  # (N, 2) m
 
     # ------------------------------------------------------------------ interface
 
@@ -175,6 +185,9 @@ class LocomotionEnv:
         """Starts an episode on every robot. `random_ages` spreads their ends in time (legged_gym, for training)."""
         everyone = np.arange(self.num_envs)
         self._resample_commands(everyone)
+        if self.terrain:
+            rows = min(self.config.start_rows, len(self.terrain.levels))
+            self.row[:] = self.rng.integers(rows, size=self.num_envs)
         self._reset(everyone)
         if random_ages:
             self.age[:] = self.rng.integers(self.episode_steps, size=self.num_envs)
@@ -226,23 +239,26 @@ class LocomotionEnv:
 
         ended = np.flatnonzero(terminated | truncated)
         info["truncated_ids"] = np.flatnonzero(truncated)
-        info["final_observation"] = Observation(*(field[truncated] for field in self.observe()))
+        info["final_observation"] = self.observe(np.flatnonzero(truncated))
         info["episode_returns"], info["episode_lengths"] = self.episode_return[ended].copy(), self.age[ended].copy()
         if len(ended):
+            self._climb(ended)
             self._reset(ended)
         return self.observe(), reward.astype(np.float32), terminated, truncated, info
 
-    def observe(self) -> Observation:
-        """The current observation (a copy)."""
-        target = self._target().reshape(self.num_envs, -1).astype(np.float32)
-        extra = {name: np.zeros((self.num_envs, 0), dtype=np.float32) for name in EXTRAS}
+    def observe(self, ids: np.ndarray | slice = slice(None)) -> Observation:
+        """The current observation of all robots or of the n robots `ids` (a copy)."""
+        history = self.history[ids]
+        target = self._target()[ids].reshape(len(history), self.num_actions).astype(np.float32)
+        heights = self.scan.read(np.arange(self.num_envs)[ids], self.position[ids], self.yaw[ids])
+        extra = {name: np.zeros((len(history), 0), dtype=np.float32) for name in EXTRAS}
         if "privileged" in self.extras:
-            extra["privileged"] = self._privileged()
+            extra["privileged"] = self._privileged()[ids]
         if "past" in self.extras:
-            extra["past"] = self.history.copy()
+            extra["past"] = history.copy()
         if "situation" in self.extras:
-            extra["situation"] = self.fault_index[:, None].astype(np.float32)
-        return Observation(self.history[:, :, -HISTORY:].copy(), target, self._scan(), **extra)
+            extra["situation"] = self.fault_index[ids, None].astype(np.float32)
+        return Observation(history[:, :, -HISTORY:].copy(), target, heights, **extra)
 
     # ------------------------------------------------------------------ episode
 
@@ -253,15 +269,20 @@ class LocomotionEnv:
         if not self._pinned:
             self.fault_index[ids] = self.rng.choice(len(self.faults), size=n, p=self._fault_odds)
         pose = self._default * self.rng.uniform(*config.start_pose, size=(n, self.num_legs, self.num_joints))
-        pose = np.clip(pose, self._limits[:, 0], self._limits[:, 1]).reshape(n, -1)
         velocity = self.rng.uniform(-config.start_speed, config.start_speed, size=(n, 6))
         self._friction[ids, :, 0] = self.rng.uniform(*config.friction, size=(n, 1))
         for index in np.unique(self.fault_index[ids]):
             chosen = self.fault_index[ids] == index
             write_fault(self.faults[index], self.robot, self.world, ids[chosen])
-        locked = self.world.bind("eq_active")[ids] > 0
-        self._qpos[ids, 7:] = np.where(locked, self._default.reshape(-1), pose)
+        locked, limits = self.world.bind("eq_active")[ids] > 0, self.world.expand("jnt_range")[ids][:, self._joints]
+        pose = np.clip(pose.reshape(n, -1), limits[:, :, 0], limits[:, :, 1])
+        self._qpos[ids[:, None], self._angle_at] = np.where(locked, self._default.reshape(-1), pose)
         self._qvel[ids, :6] = velocity
+        if self.terrain:
+            self.start[ids] = self.terrain.start(self.row[ids], self.column[ids])
+            self.start[ids, 1] += self.rng.uniform(-1, 1, size=n)  # m to the side, legged_gym
+            self._qpos[ids, :2] = self.start[ids]
+        self.scan.draw(ids)
         self.world.forward(ids, stage=mujoco.mjtStage.mjSTAGE_VEL)
 
         self.action[ids] = self.last_action[ids] = 0.0
@@ -272,6 +293,13 @@ class LocomotionEnv:
         self._resample_commands(ids[self.command_age[ids] >= round(config.command_seconds / CONTROL_DT)])
         self._steer()
         self.history[ids] = self._frame()[ids, :, None]  # as though it had always stood like this
+
+    def _climb(self, ids: np.ndarray) -> None:
+        """The terrain's curriculum, at the end of an episode."""
+        if self.terrain and self.config.climb:
+            distance = np.linalg.norm(self.position[ids, :2] - self.start[ids], axis=1)
+            speed = np.linalg.norm(self.command[ids, :2], axis=1)
+            self.row[ids] = self.terrain.next_row(self.row[ids], distance, speed, self.config.episode_seconds, self.rng)
 
     def _resample_commands(self, ids: np.ndarray) -> None:
         """A forward and a lateral speed, and a heading, for each of the robots `ids`."""
@@ -338,8 +366,8 @@ class LocomotionEnv:
         self.linear_velocity = np.einsum("nij,nj->ni", rotation, self._qvel[:, :3])
         self.angular_velocity = self._qvel[:, 3:6].copy()
         self.gravity = -rotation[:, :, 2]
-        self.joint_error = self._qpos[:, 7:].reshape(shape) - self._default
-        self.joint_velocity = self._qvel[:, 6:].reshape(shape).copy()
+        self.joint_error = self._qpos[:, self._angle_at].reshape(shape) - self._default
+        self.joint_velocity = self._qvel[:, self._velocity_at].reshape(shape)
         self.torque = self._torque.reshape(shape)
         self.link_contact = self._contacts[:, self._link_sensors] > 0
 
@@ -375,8 +403,3 @@ class LocomotionEnv:
         locked = self.world.bind("eq_active")
         strength = self.world.expand("actuator_forcerange")[:, :, 1] / self.model.actuator_forcerange[:, 1]
         return np.concatenate([locked, strength, self._friction[:, 0, :1]], axis=1).astype(np.float32)
-
-    def _scan(self) -> np.ndarray:
-        """(N, 16, 12) scandots. On flat ground every point is at z = 0, whichever way the grid is turned."""
-        height = HEIGHT_SCALE * np.clip(self._qpos[:, 2] - 0.5, -1, 1)
-        return np.broadcast_to(height.astype(np.float32)[:, None, None], (self.num_envs, *SCAN_SHAPE)).copy()

@@ -28,3 +28,11 @@ DAMAGE = {
         "rolt": _row(*[(20, 0)] * 9),
     },
 }  # fmt: skip
+
+# Table "Real-world Experiments": a physical Go1, 10 s. The paper does not say how many trials.
+REAL_WORLD = {
+    "distance_m": {
+        "rma": {"weaken": (0.0, 0.0), "box": (0.4, 0.1), "skates": (1.2, 0.1)},
+        "rolt": {"weaken": (2.8, 0.2), "box": (1.5, 0.3), "skates": (4.8, 0.2)},
+    },
+}

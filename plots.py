@@ -68,6 +68,77 @@ def bar_charts(
     save_figure(figure, picture)
 
 
+def curves(
+    panels: dict[str, dict[str, tuple[np.ndarray, np.ndarray]]], x: tuple[float, ...], picture: Path, title: str, axis_label: str
+) -> None:
+    """One panel a quantity, one curve a method with a band of one standard deviation. panels: as in `bar_charts`, the
+    means in the order of x."""
+    figure, axes = plt.subplots(1, len(panels), figsize=(5.2 * len(panels), 3.8), layout="constrained", squeeze=False)
+    for axis, (label, methods) in zip(axes[0], panels.items()):
+        for method, (mean, deviation) in methods.items():
+            (line,) = axis.plot(x, mean, marker="o", markersize=3, label=method)
+            axis.fill_between(x, mean - deviation, mean + deviation, alpha=0.12, color=line.get_color(), linewidth=0)
+        axis.set_xlabel(axis_label)
+        axis.set_ylabel(label)
+        axis.set_ylim(bottom=min(0, axis.get_ylim()[0]))
+        axis.grid(alpha=0.3)
+    axes[0, -1].legend(fontsize=8, frameon=False)
+    figure.suptitle(title, fontsize=10)
+    save_figure(figure, picture)
+
+
+def ground_map(height: np.ndarray, extent: tuple[float, float, float, float], picture: Path, title: str) -> None:
+    """Heights [m] of the ground, (rows along x, columns along y), seen from above, x upwards and y to the left.
+
+    extent: x from, x to, y from, y to [m].
+    """
+    low_x, high_x, low_y, high_y = extent
+    figure, axis = plt.subplots(figsize=(6.4, 6.8), layout="constrained")
+    image = axis.imshow(height[::-1, ::-1], extent=(high_y, low_y, low_x, high_x), cmap="terrain", vmin=-0.3, interpolation="none")
+    axis.set_xlabel("y, to the left [m]")
+    axis.set_ylabel("x, forward [m]")
+    figure.colorbar(image, ax=axis, label="height [m]", shrink=0.8)
+    figure.suptitle(title, fontsize=10)
+    save_figure(figure, picture)
+
+
+def scans(panels: dict[str, np.ndarray], picture: Path, title: str) -> None:
+    """Scandots side by side: (16, 12) heights of the ground below the trunk [m] each, forward upwards, left to the left."""
+    figure, axes = plt.subplots(1, len(panels), figsize=(2.4 * len(panels), 3.6), layout="constrained")
+    low, high = min(p.min() for p in panels.values()), max(p.max() for p in panels.values())
+    for axis, (label, heights) in zip(axes, panels.items()):
+        image = axis.imshow(heights[::-1, ::-1], cmap="viridis", vmin=low, vmax=high)
+        draw_patches(axis, heights.shape, 4)
+        axis.set_title(label, fontsize=9)
+    figure.colorbar(image, ax=axes, shrink=0.8)
+    figure.suptitle(title, fontsize=10)
+    save_figure(figure, picture)
+
+
+def attention_maps(panels: dict[str, dict[str, np.ndarray]], picture: Path) -> None:
+    """A row a situation: its (16, 12) heights, then the (12,) attention of each method on the 4 x 3 patches."""
+    rows, columns = len(panels), max(len(row) for row in panels.values())
+    figure, axes = plt.subplots(rows, columns, figsize=(2.6 * columns, 3.4 * rows), layout="constrained", squeeze=False)
+    for line, (situation, row) in zip(axes, panels.items()):
+        for axis, (name, values) in zip(line, row.items()):
+            heights = name == "heights"
+            grid = values if heights else values.reshape(4, 3)
+            limits = {} if heights else {"vmin": 0, "vmax": max(0.25, values.max())}
+            image = axis.imshow(grid[::-1, ::-1], cmap="viridis" if heights else "magma", **limits)
+            draw_patches(axis, grid.shape, 4 if heights else 1)
+            axis.set_title(f"{situation}: {'heights [m]' if heights else name}", fontsize=9)
+            figure.colorbar(image, ax=axis, shrink=0.7)
+    save_figure(figure, picture)
+
+
+def draw_patches(axis, shape: tuple[int, int], side: int) -> None:
+    """White lines between patches of side x side cells."""
+    axis.set_xticks(np.arange(0, shape[1] + 1, side) - 0.5, [])
+    axis.set_yticks(np.arange(0, shape[0] + 1, side) - 0.5, [])
+    axis.grid(color="white", linewidth=1)
+    axis.tick_params(length=0)
+
+
 def ratio_bands(rows: list[dict], picture: Path, title: str) -> None:
     """PPO's ratio against the dropout rate, a band for each way to treat the masks, and the share that PPO clips."""
     labels = {

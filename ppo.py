@@ -19,8 +19,9 @@ import torch.distributed as dist
 from torch import Tensor, nn
 from torch.distributions import Normal, kl_divergence
 
-from env import HEIGHT_SCALE, LocomotionEnv, Observation
+from env import LocomotionEnv, Observation
 from normalizer import Normalizer
+from scandots import HEIGHT_SCALE
 
 
 @dataclass(frozen=True)

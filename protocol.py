@@ -1,4 +1,4 @@
-"""What the paper's experiments share: episodes of a policy, the rows of a CSV file, tables and bar charts.
+"""What the paper's experiments share: episodes of a policy, the rows of a CSV file, tables and charts.
 
 An episode is one robot with one fault, told to walk straight on. Rows of a CSV file are episodes:
 method, checkpoint, seed (of the training), case, episode, distance_m, fall_time_s, episode_return.
@@ -12,15 +12,17 @@ import torch
 
 from env import CONTROL_DT, EnvConfig, LocomotionEnv
 from faults import Fault
-from plots import bar_charts
+from plots import bar_charts, curves
 from ppo import to_tensors
 
 
 @torch.no_grad()
 def run_episodes(
-    policy, robot: str, faults: list[Fault], speed: float, seconds: float, seed: int = 0, threads: int = 0
+    policy, robot: str, faults: list[Fault], speed: float, seconds: float, seed: int = 0, threads: int = 0, **env_options
 ) -> dict[str, np.ndarray]:
     """One episode on each of len(faults) robots, robot i with faults[i], told to walk straight on at `speed`.
+
+    env_options: of LocomotionEnv, such as terrain (robots start on its first row) and noise.
 
     Starts vary as in training (pose, velocity, friction); nobody is pushed. A fall is what ends an episode in
     training: the trunk touches the ground or tilts by more than 60 degrees.
@@ -31,9 +33,11 @@ def run_episodes(
     config = EnvConfig(
         episode_seconds=seconds + 1.0,  # nobody times out before we stop
         forward_speed=(speed, speed), lateral_speed=(0.0, 0.0), heading=(0.0, 0.0), push_speed=0.0,
+        start_rows=1, climb=False,
     )  # fmt: skip
-    env = LocomotionEnv(robot, len(faults), seed, threads, config=config, extras=policy.extras)
-    env.pin_faults(faults)
+    situations = [(1.0, fault) for fault in faults]
+    env = LocomotionEnv(robot, len(faults), seed, threads, situations, config, policy.extras, **env_options)
+    env.pin_faults(faults)  # one each
     observation = env.reset()
     start, steps = env.position[:, 0].copy(), round(seconds / CONTROL_DT)
     distance, returns = np.zeros(len(faults)), np.zeros(len(faults))
@@ -51,14 +55,13 @@ def run_episodes(
     return {"distance_m": distance, "fall_time_s": fall_time, "episode_return": returns}
 
 
-def run_cases(args, cases: dict[str, Fault], speed: float) -> list[dict]:
+def run_cases(args, cases: dict[str, Fault], speed: float, **env_options) -> list[dict]:
     """Every checkpoint on every case, `args.episodes` robots each: the rows of the CSV file."""
     faults = [fault for fault in cases.values() for _ in range(args.episodes)]
     labels = [(case, episode) for case in cases for episode in range(args.episodes)]
     rows = []
     for path, (policy, card) in args.policies.items():
-        print(f"{card['policy']}: {path} ({card['steps'] / 1e6:.1f}M steps, seed {card['seed']})", flush=True)
-        outcome = run_episodes(policy, args.robot, faults, speed, args.seconds, args.seed, args.threads)
+        outcome = run_episodes(policy, args.robot, faults, speed, args.seconds, args.seed, args.threads, **env_options)
         for i, (case, episode) in enumerate(labels):
             measured = {name: f"{values[i]:.4f}" for name, values in outcome.items()}
             row = {"method": card["policy"], "checkpoint": str(path), "seed": card["seed"], "case": case}
@@ -73,24 +76,60 @@ def report(args, rows: list[dict], cases: list[str], labels: list[str], name: st
     cases, labels: as in `rows`, and as they are to be shown. paper: {column: {method: {case: (mean, sd)}}}.
     """
     write_csv(args.out / f"{name}.csv", rows)
-    methods, panels = list(dict.fromkeys(row["method"] for row in rows)), {}
+    panels = {}
     for column, quantity in (("distance_m", "distance walked [m]"), ("fall_time_s", "time of the first fall [s]")):
-        table = panels[quantity] = {method: mean_and_deviation(rows, method, cases, column) for method in methods}
-        width = max(14, *(len(label) + 2 for label in labels))
-        print(f"\n{quantity:28}" + "".join(f"{label:>{width}}" for label in labels))
-        for method, pairs in table.items():
-            print(f"{method:28}" + "".join(f"{f'{mean:.2f} ± {deviation:.2f}':>{width}}" for mean, deviation in zip(*pairs)))
-            known = paper.get(column, {}).get(method, {})
-            if known:
-                words = ["{:.2f} ± {:.2f}".format(*known[case]) if case in known else "-" for case in cases]
-                print(f"{'  (paper)':28}" + "".join(f"{word:>{width}}" for word in words))
-    print(f"\nepisodes with a fall, of {args.episodes}")
-    for method in methods:
-        mine = [row for row in rows if row["method"] == method]
-        falls = [sum(float(r["fall_time_s"]) < args.seconds for r in mine if r["case"] == case) for case in cases]
-        print(f"{method:28}" + "".join(f"{n:>{width}}" for n in falls))
+        panels[quantity] = print_table(rows, cases, labels, column, quantity, paper.get(column, {}))
+    print_falls(args, rows, cases, labels)
     bar_charts(panels, labels, args.out / f"{name}.png", title)
     print(f"\nwritten: {args.out / f'{name}.csv'}, {args.out / f'{name}.png'}")
+
+
+def report_curves(args, rows: list[dict], scales: tuple[float, ...], name: str, title: str, axis: str) -> None:
+    """As `report`, for cases that are the scales of some noise: tables, and a curve a method. The last table is what is left
+    of the distance at the largest scale."""
+    write_csv(args.out / f"{name}.csv", rows)
+    cases, labels, panels = [f"{scale:g}" for scale in scales], [f"{scale:g} m" for scale in scales], {}
+    for column, quantity in (("episode_return", "return of an episode"), ("distance_m", "distance walked [m]")):
+        panels[quantity] = print_table(rows, cases, labels, column, quantity)
+    print_falls(args, rows, cases, labels)
+    print(f"\ndistance at {labels[-1]}, of the clean one")
+    for method, (mean, _) in panels["distance walked [m]"].items():
+        print(f"{method:28}{mean[-1] / mean[0]:>14.0%}")
+    curves(panels, scales, args.out / f"{name}.png", title, axis)
+    print(f"\nwritten: {args.out / f'{name}.csv'}, {args.out / f'{name}.png'}")
+
+
+def methods_of(rows: list[dict]) -> list[str]:
+    return list(dict.fromkeys(row["method"] for row in rows))
+
+
+def print_table(
+    rows: list[dict], cases: list[str], labels: list[str], column: str, quantity: str, paper: dict = {}
+) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """Prints and returns {method: (means, standard deviations)}, one number a case; paper: {method: {case: (mean, sd)}}."""
+    table = {method: mean_and_deviation(rows, method, cases, column) for method in methods_of(rows)}
+    width = column_width(labels)
+    print(f"\n{quantity:28}" + "".join(f"{label:>{width}}" for label in labels))
+    for method, pairs in table.items():
+        print(f"{method:28}" + "".join(f"{f'{mean:.2f} ± {deviation:.2f}':>{width}}" for mean, deviation in zip(*pairs)))
+        if known := paper.get(method):
+            words = ["{:.2f} ± {:.2f}".format(*known[case]) if case in known else "-" for case in cases]
+            print(f"{'  (paper)':28}" + "".join(f"{word:>{width}}" for word in words))
+    return table
+
+
+def print_falls(args, rows: list[dict], cases: list[str], labels: list[str]) -> None:
+    """How many episodes of each method and case ended in a fall."""
+    total = len([row for row in rows if (row["method"], row["case"]) == (rows[0]["method"], cases[0])])
+    print(f"\nepisodes with a fall, of {total}")
+    for method in methods_of(rows):
+        mine = [row for row in rows if row["method"] == method]
+        falls = [sum(float(r["fall_time_s"]) < args.seconds for r in mine if r["case"] == case) for case in cases]
+        print(f"{method:28}" + "".join(f"{n:>{column_width(labels)}}" for n in falls))
+
+
+def column_width(labels: list[str]) -> int:
+    return max(14, *(len(label) + 2 for label in labels))
 
 
 def mean_and_deviation(rows: list[dict], method: str, cases: list[str], column: str) -> tuple[np.ndarray, np.ndarray]:

@@ -46,13 +46,14 @@ def film(
     `warm_up` seconds. Links behind a fault are red. The film ends where the robot falls.
     """
     config = EnvConfig(forward_speed=(speed, speed), heading=(0.0, 0.0), push_speed=0.0, episode_seconds=3600)
-    env = LocomotionEnv(robot, 1, seed, 1, config=config, extras=policy.extras)
-    env.pin_faults([fault])
+    env = LocomotionEnv(robot, 1, seed, 1, ((1.0, fault),), config, policy.extras)
     observation = env.reset()
-    model = env.model
-    faulty = np.flatnonzero(joint_mask((*fault.locked, *(part for part, _ in fault.strength)), env.robot))
-    for joint in faulty:
-        model.geom_rgba[model.geom_bodyid == model.body(env.robot.joints[joint]).id] = [0.85, 0.2, 0.15, 1]
+    model = env.world.get_model(0)  # with what the fault changed on it
+    faulty = (*fault.locked, *(part for part, _ in (*fault.strength, *fault.half_locked)))
+    bodies = [f"{leg}_wheel" for leg in fault.skating]
+    bodies += [name for name, bad in zip(env.robot.joints, joint_mask(faulty, env.robot)) if bad]
+    for body in bodies:
+        model.geom_rgba[model.geom_bodyid == model.body(body).id] = [0.85, 0.2, 0.15, 1]
     renderer = make_renderer(model, width, height)
     data, camera, frames = mujoco.MjData(model), mujoco.MjvCamera(), []
     camera.distance, camera.azimuth, camera.elevation = 1.3, 125, -18

@@ -8,6 +8,9 @@ What a fault (faults.py) will change on one robot is prepared here, so that a fa
     joint lock      an inactive equality constraint a joint        -> eq_active, eq_data
     motor strength  a position actuator a joint                    -> actuator_gainprm, _biasprm, _forcerange
     friction        the robot's geoms decide it (priority 1)       -> geom_friction
+    half-lock       a joint's stops                                -> jnt_range
+    box to tow      a box on a tether, slack without end           -> tendon_range       only built when asked for
+    skate           a foot that is a wheel, its brake on           -> dof_frictionloss   only built when asked for
 
 Legend: L legs, J joints a leg. Legs are ordered FR, FL, RR, RL (front/rear, right/left), joints hip, thigh, calf.
 
@@ -19,7 +22,19 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
+from terrain import Terrain
+
 PHYSICS_DT = 0.005  # s, legged_gym: 200 Hz physics, 4 substeps a control step of 50 Hz
+
+# The props of the real-world test. The paper gives no numbers: all ours.
+BOX_MASS = 4.0  # kg, a third of a Go1
+BOX_FRICTION = 0.5  # cardboard on a floor: 20 N to drag it, a sixth of a Go1's weight, on one leg
+BOX_SIZE = (0.3, 0.3, 0.2)  # m
+BOX_START = (-0.95, 0.0, 0.1)  # m, behind the robot: no leg's tether is taut at first
+TETHER = 0.8  # m
+SLACK = 1000.0  # m, the length of a tether that nobody has tied
+WHEEL_MASS = 0.1  # kg
+BRAKE = 10.0  # N m, dry friction of a wheel that does not roll; on a foot of 0.02 m four times a robot's weight
 
 Vec3 = tuple[float, float, float]
 Inertia = tuple[float, float, float, float, float, float]  # Ixx, Iyy, Izz, Ixy, Ixz, Iyz
@@ -70,12 +85,20 @@ class Robot:
         return [f"{leg}_{link.name}" for leg in self.legs for link in self.links]
 
 
-def build_model(robot: Robot) -> mujoco.MjModel:
-    """The robot on flat ground. Bodies and actuators in the order of `robot.joints`; keyframe 0 is the default pose.
+def build_model(
+    robot: Robot, terrain: Terrain | None = None, towing: tuple[str, ...] = (), skating: tuple[str, ...] = ()
+) -> mujoco.MjModel:
+    """The robot on flat ground or on a terrain. Bodies and actuators in the order of `robot.joints`; keyframe 0 is the
+    default pose.
 
     Contacts are robot-ground only. Sensors `contact_<geom>` count the contacts of the trunk, of each link with a
     capsule, and of each foot.
+
+    towing: legs whose foot gets a tether to one box. skating: legs whose foot becomes a wheel. Both add bodies and
+    joints (find a robot's own by name), and change nothing until faults.py ties the tether or lets go the brake.
     """
+    if unknown := {*towing, *skating} - set(robot.legs):
+        raise ValueError(f"the {robot.name} has no leg {', '.join(sorted(unknown))}; it has {', '.join(robot.legs)}")
     spec = mujoco.MjSpec()
     spec.modelname = robot.name
     spec.compiler.degree = False
@@ -86,6 +109,8 @@ def build_model(robot: Robot) -> mujoco.MjModel:
     spec.option.ls_iterations = 20
 
     _add_world(spec)
+    if terrain is not None:
+        terrain.build(spec)
     trunk = spec.worldbody.add_body(name="trunk", pos=[0, 0, robot.start_height])
     trunk.add_freejoint(name="root")
     trunk.add_light(
@@ -95,8 +120,10 @@ def build_model(robot: Robot) -> mujoco.MjModel:
     _set_inertia(trunk, robot.trunk_mass, robot.trunk_com, robot.trunk_inertia)
     _add_geom(spec, trunk, "trunk", mujoco.mjtGeom.mjGEOM_BOX, np.array(robot.trunk_box) / 2)
 
+    angles = []  # of all joints after the root, in the order of qpos
     for leg, mount, pose in zip(robot.legs, robot.mounts, robot.default_pose):
         parent = trunk
+        angles += pose
         for i, (link, angle) in enumerate(zip(robot.links, pose)):
             left, rear = mount[1] > 0, mount[0] < 0
             mirror = np.array([-1 if rear and link.rear_mirrors_x else 1, -1 if left else 1, 1])
@@ -123,11 +150,16 @@ def build_model(robot: Robot) -> mujoco.MjModel:
             lock.solimp = [0.99, 0.9999, 0.001, 0.5, 2]
             parent = body
         foot = mirror * robot.foot_position
+        if leg in towing:
+            body.add_site(name=f"{leg}_ankle", pos=foot)
+        if leg in skating:
+            body, foot = _add_wheel(body, leg, foot, robot.foot_radius), np.zeros(3)
+            angles.append(0.0)
         _add_geom(spec, body, f"{leg}_foot", mujoco.mjtGeom.mjGEOM_SPHERE, [robot.foot_radius, 0, 0], pos=foot)
 
     spec.add_key(
         name="default",
-        qpos=[0, 0, robot.start_height, 1, 0, 0, 0, *np.ravel(robot.default_pose)],
+        qpos=[0, 0, robot.start_height, 1, 0, 0, 0, *angles, *(_add_box(spec, towing) if towing else ())],
         ctrl=np.ravel(robot.default_pose),
     )
     return spec.compile()
@@ -161,6 +193,41 @@ def _add_geom(spec: mujoco.MjSpec, body, name: str, kind, size, **where) -> None
         name=f"contact_{name}", type=mujoco.mjtSensor.mjSENS_CONTACT, objtype=mujoco.mjtObj.mjOBJ_GEOM, objname=name,
         intprm=[1 << mujoco.mjtConDataField.mjCONDATA_FOUND.value, 0, 1],  # fields, reduction, slots
     )  # fmt: skip
+
+
+def _add_wheel(body, leg: str, foot, radius: float):
+    """A wheel in the foot's place, its axle across the leg: it rolls the way the foot points and grips sideways.
+
+    Not two numbers of friction instead: MuJoCo's belong to the contact's frame, which does not turn with the foot.
+    Not a foot without friction: a skate that could slip sideways would be ice.
+    """
+    wheel, moment = body.add_body(name=f"{leg}_wheel", pos=foot), 0.4 * WHEEL_MASS * radius**2  # a solid ball
+    _set_inertia(wheel, WHEEL_MASS, (0, 0, 0), (moment, moment, moment, 0, 0, 0))
+    wheel.add_joint(
+        name=f"{leg}_wheel", axis=(0, 1, 0), frictionloss=BRAKE,
+        solref_friction=[2 * PHYSICS_DT, 1], solimp_friction=[0.9999, 0.9999, 0.001, 0.5, 2],  # or else the brake creeps
+    )  # fmt: skip
+    return wheel
+
+
+def _add_box(spec: mujoco.MjSpec, legs: tuple[str, ...]) -> tuple[float, ...]:
+    """A box on the ground and a tether to it from the foot of each of the legs. Returns its 7 numbers of qpos.
+
+    A tether is a limit on a distance: it pulls when that is reached and is nothing before. The box touches the
+    ground alone, as all geoms do.
+    """
+    box = spec.worldbody.add_body(name="box", pos=BOX_START)
+    box.add_freejoint(name="box")
+    box.add_geom(
+        name="box", type=mujoco.mjtGeom.mjGEOM_BOX, size=np.array(BOX_SIZE) / 2, mass=BOX_MASS, contype=0, conaffinity=1,
+        condim=3, priority=1, friction=[BOX_FRICTION, 0.005, 0.0001], rgba=[0.76, 0.60, 0.42, 1],
+    )  # fmt: skip
+    box.add_site(name="box_front", pos=[BOX_SIZE[0] / 2, 0, 0])
+    for leg in legs:
+        tether = spec.add_tendon(name=f"{leg}_tether", limited=True, range=[-1, SLACK], width=0.004, rgba=[0.2, 0.2, 0.2, 1])
+        tether.wrap_site(f"{leg}_ankle")
+        tether.wrap_site("box_front")
+    return (*BOX_START, 1, 0, 0, 0)
 
 
 def _set_inertia(body, mass: float, com, inertia) -> None:

@@ -24,8 +24,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from env import HISTORY, SCAN_SHAPE, Observation
+from env import HISTORY, Observation
 from normalizer import Normalizer
+from scandots import SCAN_SHAPE
 
 SIGMA_BOUNDS = (math.log(0.05), math.log(2.0))  # ours
 

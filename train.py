@@ -45,7 +45,7 @@ from rewards import REWARDS
 from robots import ROBOTS
 
 # What a run may not change when it is resumed; of rma and roam, whose stages are shares of them, the steps neither.
-IDENTITY = ("robot", "task", "policy", "envs", "epochs", "minibatches", "seed", "processes", "device")
+IDENTITY = ("robot", "task", "policy", "envs", "epochs", "minibatches", "seed", "processes", "device", "init")
 STAGED = ("rma", "roam")
 EPISODES = ("episodes", "returns", "lengths", "falls")  # figures of finished episodes, added up over a rollout
 
@@ -65,6 +65,7 @@ def parse_arguments(argv: list[str] | None = None):
     parser.add_argument("--threads", type=threads, default=num_cores(), help="cores to use (default: all)")
     parser.add_argument("--out", type=Path, help="folder of the run (default: runs/ROBOT-TASK-POLICY-seedN)")
     parser.add_argument("--resume", action="store_true", help="go on from the checkpoint in that folder")
+    parser.add_argument("--init", metavar="FILE", help="start from the weights in a policy.pt or checkpoint.pt: flat, then stairs")
     parser.add_argument("--save-minutes", type=positive, default=3.0, help="time between two checkpoints")
     args = parser.parse_args(argv)
 
@@ -151,6 +152,7 @@ def sum_over_processes(figures: dict[str, float], device) -> dict[str, float]:
 def summarise(infos: list[dict], buffer: RolloutBuffer, env: LocomotionEnv) -> tuple[dict, dict]:
     """What a rollout was like on this process's robots: figures to average over processes, and figures to add up."""
     means = {name: sum(i[name].mean() for i in infos) / len(infos) for name in ("speed", "commanded_speed")}
+    means["row"] = env.row.mean()  # of the terrain: how far the curriculum is
     for term in REWARDS:
         means[f"reward_{term.__name__}"] = sum(i["rewards"][term.__name__].mean() for i in infos) / len(infos)
     sums = {
@@ -170,7 +172,8 @@ class Part:
         threads = args.threads if args.device == "cuda" else 1
         share, seeds = args.envs // args.processes, (args.seed, rank, number)
         self.number, self.actor = number, stage.actor
-        self.env = LocomotionEnv(args.robot, share, seeds, threads, stage.faults, extras=stage.extras)
+        terrain = TASKS[args.task].terrain
+        self.env = LocomotionEnv(args.robot, share, seeds, threads, stage.faults, extras=stage.extras, terrain=terrain)
         self.observation = self.env.reset(random_ages=True)
         self.critic = (Critic(self.observation, stage.actor.normalizer) if stage.critic is None else stage.critic).to(device)
         policy.requires_grad_(False)
@@ -200,12 +203,14 @@ def train(rank: int, args, sync: str | None, stop: list) -> None:
     ends = [args.steps * sum(stage.share for stage in stages[: i + 1]) for i in range(len(stages) - 1)] + [args.steps]
     generator = torch.Generator(device).manual_seed(args.seed * 1_000_003 + rank)  # actions, masks, minibatches
     part = Part(0, stages[0], args, rank, policy, device)
+    if args.init and not args.resume:
+        checkpoint.start_from(args.init, args.robot, policy, part.critic)
     iteration, steps = 0, 0
     recent = np.zeros((20, len(EPISODES)))  # of the last iterations: episodes end now and then
 
     def state() -> dict:
         """What checkpoint.pt holds: all that the next iteration depends on (of this process, for all of them)."""
-        content = {key: getattr(args, key) for key in ("robot", "task", "policy", "seed")} | {"steps": steps}
+        content = {key: getattr(args, key) for key in ("robot", "task", "policy", "seed", "init")} | {"steps": steps}
         content["weights"] = {name: tensor.cpu() for name, tensor in policy.state_dict().items()}
         content |= {"critic": part.critic.state_dict(), "learner": part.learner.state_dict()}
         content |= {"iteration": iteration, "stage": part.number, "recent": torch.from_numpy(recent)}
@@ -246,7 +251,7 @@ def train(rank: int, args, sync: str | None, stop: list) -> None:
         if rank == 0:
             with open(progress.path) as file:
                 os.fsync(file.fileno())  # no checkpoint without its rows
-            checkpoint.save({key: content[key] for key in (*checkpoint.CARD, "weights")}, args.out / "policy.pt")
+            checkpoint.save({key: content[key] for key in (*checkpoint.CARD, "init", "weights")}, args.out / "policy.pt")
             checkpoint.save_next(content, args.out / "checkpoint.pt")
             learning_curve(progress.path, args.out / "progress.png")
 
@@ -288,7 +293,8 @@ def train(rank: int, args, sync: str | None, stop: list) -> None:
         policy_file = args.out / "policy.pt"
         if steps < args.steps:
             print(f"\nstopped at {steps:,} steps and saved; the same command with --resume goes on")
-        print(f"\ntrained: {policy_file}\ntest it: python evaluate.py {args.task} --checkpoints {policy_file}")
+        test = "stairs" if args.task == "terrain" else args.task
+        print(f"\ntrained: {policy_file}\ntest it: python evaluate.py {test} --checkpoints {policy_file}")
     if args.processes > 1:
         dist.destroy_process_group()
 
@@ -314,7 +320,7 @@ def identity(args) -> dict:
     constants = {f"{type(c).__name__}.{name}": str(value) for c in configs for name, value in asdict(c).items()}
     constants |= {f"weight of {term.__name__}": str(weight) for term, weight in REWARDS.items()}
     constants["faults"] = ", ".join(f"{share:g} {fault}" for share, fault in TASKS[args.task].training)
-    return options | constants
+    return options | constants | {"terrain": str(TASKS[args.task].terrain)}
 
 
 def train_all(words: list[str], args) -> None:
@@ -346,6 +352,8 @@ def main(argv: list[str] | None = None) -> None:
             differing = [f"{key} was {was[key]}, is {now[key]}" for key in now if key in was and was[key] != now[key]]
             if differing:
                 fail(f"the run in {args.out} was another one: {'; '.join(differing)}")
+        elif args.init:  # tried here, where it can be said in one line
+            checkpoint.start_from(args.init, args.robot, make_policy(args.policy, ROBOTS[args.robot], TASKS[args.task]))
     except CheckpointError as error:
         fail(error)
     run(train, args)

@@ -123,7 +123,7 @@ def test_all_methods_in_turn_and_evaluated_together(tmp_path, monkeypatch, capsy
     before = [Path(file).stat().st_mtime_ns for file in files]
     train.main(command)  # all is finished: nothing is touched
     assert [Path(file).stat().st_mtime_ns for file in files] == before
-    quick = ["--episodes", "1", "--seconds", "0.1", "--out", "out"]
+    quick = ["--episodes", "1", "--seconds", "0.1", "--threads", "1", "--out", "out"]
     evaluate.main(["stiffness", "--checkpoints", *files, *quick])
     assert list(dict.fromkeys(row["method"] for row in rows(Path("out/stiffness.csv")))) == list(METHODS)
     capsys.readouterr()
@@ -136,10 +136,30 @@ def test_all_methods_in_turn_and_evaluated_together(tmp_path, monkeypatch, capsy
     assert "for rolt, not for mlp" in capsys.readouterr().err
 
 
+def test_noise_tests_and_attention_on_stairs(tmp_path, capsys):
+    quick = ["--threads", "1", *SMALL, "--steps", "192"]
+    flat, stairs, ablation = (str(tmp_path / name) for name in ("flat", "stairs", "ablation"))
+    train.main([*quick, "--out", flat])
+    train.main([*quick, "--task", "terrain", "--out", stairs, "--init", f"{flat}/checkpoint.pt"])
+    train.main([*quick, "--task", "terrain", "--out", ablation, "--init", f"{flat}/policy.pt", "--policy", "no-pe-drop"])
+    assert checkpoint.load(f"{stairs}/policy.pt")["init"] == f"{flat}/checkpoint.pt"
+    with pytest.raises(SystemExit):
+        train.main([*quick, "--task", "terrain", "--out", str(tmp_path / "mlp"), "--init", f"{flat}/policy.pt", "--policy", "mlp"])
+    assert "do not fit this policy" in capsys.readouterr().err
+    files = [f"{stairs}/policy.pt", f"{ablation}/policy.pt"]
+    test = ["--checkpoints", *files, "--episodes", "1", "--seconds", "0.1", "--threads", "1", "--out", str(tmp_path)]
+    for name in ("low_frequency", "high_frequency"):
+        evaluate.main([name, *test])
+        assert [row["case"] for row in rows(tmp_path / f"{name}.csv")][::2] == ["0", "0.05", "0.1", "0.2", "0.4", "0.8"]
+    evaluate.main(["attention", *test])
+    assert capsys.readouterr().out.count("entropy 1.00") == 4  # a gaze that has learned nothing is even
+    assert all((tmp_path / f"{name}.png").stat().st_size > 1000 for name in ("low_frequency", "high_frequency", "attention"))
+
+
 def test_damage_test_stands_beside_the_papers(tmp_path, capsys):
     card = {"robot": "hexapod", "task": "damage", "policy": "rolt", "steps": 0, "seed": 0}
     checkpoint.save(card | {"weights": make_policy("rolt", ROBOTS["hexapod"]).state_dict()}, tmp_path / "policy.pt")
-    quick = ["--episodes", "1", "--seconds", "0.1", "--out", str(tmp_path)]
+    quick = ["--episodes", "1", "--seconds", "0.1", "--threads", "1", "--out", str(tmp_path)]
     evaluate.main(["damage", "--checkpoints", str(tmp_path / "policy.pt"), *quick])
     cases = [row["case"] for row in rows(tmp_path / "damage.csv")]
     assert cases == "healthy FRT MRT MLC FLC FLT FRC MRC MLT HLT HLC HRT HRC".split()

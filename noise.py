@@ -1,0 +1,113 @@
+"""Noise on the scandots, for tests: policies are trained on clean ones (section IV-B of the paper).
+
+    low frequency   k of the 12 patches are each "offset as a whole by a distance in random directions"
+    high frequency  every point is "shifted vertically and laterally with Gaussian noise independently"
+    missing         k patches read zero (the paper's attention figure)
+
+A shift is three-dimensional. Its lateral part moves the point at which the ground is read, so it acts before the
+terrain is looked up: beside an edge it matters, on flat ground it does not. Its vertical part adds to the height.
+
+Pure functions with an explicit generator. Legend: n robots, 16 x 12 points forward x left, 12 patches of 4 x 4.
+
+    python noise.py             # draws clean and noisy scans of stairs to results/noise.png
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from plots import scans
+from scandots import HEIGHT_SCALE, NUM_PATCHES, PATCH, SCAN_SHAPE, scan
+from terrain import Terrain
+
+
+@dataclass(frozen=True)
+class ScanNoise:
+    """What is wrong with the scan; the default is nothing."""
+
+    offset: float = 0.0  # m, how far each chosen patch is moved, in a direction of its own
+    offset_patches: int = 4  # k, ours: the paper says "a certain number"
+    missing_patches: int = 0  # k that read zero
+    sigma: float = 0.0  # m, standard deviation of every point's shift in x, y and z
+    redraw: bool = False  # patches and directions are drawn at each step instead of once an episode
+
+    def __post_init__(self):
+        if not (0 <= self.offset_patches <= NUM_PATCHES and 0 <= self.missing_patches <= NUM_PATCHES):
+            raise ValueError(f"0 to {NUM_PATCHES} patches can be offset or missing")
+        if min(self.offset, self.sigma) < 0:
+            raise ValueError("the scale of noise is not negative")
+
+
+def spread(patches: np.ndarray) -> np.ndarray:
+    """(n, 12, ...) a value a patch -> (n, 16, 12, ...) a value a point; patches in ROLT's order, row by row."""
+    rows, columns = (size // PATCH for size in SCAN_SHAPE)
+    grid = patches.reshape(len(patches), rows, columns, *patches.shape[2:])
+    return grid.repeat(PATCH, axis=1).repeat(PATCH, axis=2)
+
+
+def choose_patches(n: int, count: int, rng: np.random.Generator) -> np.ndarray:
+    """(n, 12) bool, `count` random patches of every scan."""
+    return rng.random((n, NUM_PATCHES)).argsort(axis=1) < count
+
+
+def patch_shifts(noise: ScanNoise, n: int, rng: np.random.Generator) -> np.ndarray:
+    """(n, 16, 12, 3) m, low frequency: the chosen patches' shift in a direction uniform on the sphere, 0 elsewhere."""
+    direction = rng.normal(size=(n, NUM_PATCHES, 3))
+    direction *= noise.offset / np.linalg.norm(direction, axis=2, keepdims=True)
+    return spread(direction * choose_patches(n, noise.offset_patches, rng)[:, :, None])
+
+
+def point_shifts(noise: ScanNoise, n: int, rng: np.random.Generator) -> np.ndarray:
+    """(n, 16, 12, 3) m, high frequency: Gaussian, every point and axis for itself."""
+    return noise.sigma * rng.normal(size=(n, *SCAN_SHAPE, 3))
+
+
+def missing_points(noise: ScanNoise, n: int, rng: np.random.Generator) -> np.ndarray:
+    """(n, 16, 12) bool, the points of the patches that read zero."""
+    return spread(choose_patches(n, noise.missing_patches, rng))
+
+
+class NoisyScan:
+    """The scandots of N robots as they see them. Its random generator is its own: noise changes nothing but the scan."""
+
+    def __init__(self, num_envs: int, terrain: Terrain | None, noise: ScanNoise, seed: int | tuple[int, ...]):
+        self.terrain, self.noise, self.rng = terrain, noise, np.random.default_rng(seed)
+        self.shift = np.zeros((num_envs, *SCAN_SHAPE, 3))  # m, of the patches
+        self.missing = np.zeros((num_envs, *SCAN_SHAPE), dtype=bool)
+
+    def draw(self, ids: np.ndarray) -> None:
+        """Patches and directions anew for the robots `ids`: at a reset, or before every reading (`ScanNoise.redraw`)."""
+        if self.noise.offset:
+            self.shift[ids] = patch_shifts(self.noise, len(ids), self.rng)
+        if self.noise.missing_patches:
+            self.missing[ids] = missing_points(self.noise, len(ids), self.rng)
+
+    def read(self, ids: np.ndarray, position: np.ndarray, yaw: np.ndarray) -> np.ndarray:
+        """(n, 16, 12) float32 scaled heights for the n robots `ids`, whose trunks are at position (n, 3) m, yaw (n,) rad."""
+        if self.noise == ScanNoise():
+            return scan(self.terrain, position, yaw)
+        if self.noise.redraw:
+            self.draw(ids)
+        heights = scan(self.terrain, position, yaw, self.shift[ids] + point_shifts(self.noise, len(ids), self.rng))
+        heights[self.missing[ids]] = 0.0
+        return heights
+
+
+def main() -> None:
+    stairs, rng = Terrain(("stairs",), (3,)), np.random.default_rng(0)
+    position, yaw = np.array([[1.4, 0.0, 0.45]]), np.zeros(1)  # where a robot stands on the third step
+    low, high = ScanNoise(offset=0.3), ScanNoise(sigma=0.1)
+    panels = {
+        "clean": scan(stairs, position, yaw),
+        "low frequency\n4 patches by 0.3 m": scan(stairs, position, yaw, patch_shifts(low, 1, rng)),
+        "high frequency\nsigma 0.1 m": scan(stairs, position, yaw, point_shifts(high, 1, rng)),
+    }
+    missing = np.where(missing_points(ScanNoise(missing_patches=4), 1, rng), 0, panels["clean"])
+    panels = {name: heights[0] / HEIGHT_SCALE for name, heights in (panels | {"4 patches missing": missing}).items()}
+    scans(panels, Path(__file__).parent / "results" / "noise.png", "Trunk height - 0.5 m - ground [m]; forward is up")
+    print("written: results/noise.png")
+
+
+if __name__ == "__main__":
+    main()
