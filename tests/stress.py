@@ -121,8 +121,9 @@ def resume(number: int, dice: random.Random, folder: Path) -> str:
             whole, broken = folder / f"{policy}{processes}", folder / f"{policy}{processes}-broken"
             finish(start(*words, "--out", whole))
             for k in sorted(dice.sample(range(1, 23), number)):
+                done = iterations(broken)
                 process = start(*words, "--out", broken, *["--resume"] * broken.exists())
-                wait_for(lambda: iterations(broken) >= k, process)
+                wait_for(lambda: iterations(broken) >= max(k, done + 1), process)
                 process.terminate()
                 finish(process)
                 stops.append(saved(broken)["iteration"])
