@@ -228,8 +228,8 @@ def train(rank: int, args, sync: str | None, stop: list) -> None:
         part.learner.optimizer.step()  # with gradients that are still 0: moves nothing, but makes the state that is compared
         own = state()
         saved = {"recent": own["recent"], "torch": own["torch"]} | saved  # files of before had neither
-        for key in own.keys() - {"identity"}:
-            if why := checkpoint.misfit(saved.get(key), own[key], key):
+        for key in own:
+            if key != "identity" and (why := checkpoint.misfit(saved.get(key), own[key], key)):
                 raise CheckpointError(f"the checkpoint in {args.out} does not fit this run: {why}")
         (iteration, steps, _), recent, mine = place, saved["recent"].numpy(), saved["processes"][rank]
         policy.load_state_dict(saved["weights"])
