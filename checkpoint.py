@@ -37,9 +37,10 @@ def save(content: dict, path: Path) -> None:
             file.flush()
             os.fsync(file.fileno())
         os.replace(temporary, path)
-    except (OSError, RuntimeError) as error:  # torch.save reports a full disk as a RuntimeError
+    except (OSError, RuntimeError) as error:
         temporary.unlink(missing_ok=True)
-        raise OSError(f"cannot write {path}: {error}; what was saved there before is untouched") from error
+        why = error if isinstance(error, OSError) else "there is no room for it"  # torch.save's RuntimeError of a full disk
+        raise OSError(f"cannot write {path}: {why}; what was saved there before is untouched") from error
 
 
 def save_next(content: dict, path: Path) -> None:

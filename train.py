@@ -231,8 +231,8 @@ def train(rank: int, args, sync: str | None, stop: list) -> None:
         part.learner.optimizer.step()  # with gradients that are still 0: moves nothing, but makes the state that is compared
         own = state()
         saved = {"recent": own["recent"], "torch": own["torch"]} | saved  # files of before had neither
-        for key in own.keys() - {"identity"}:
-            if why := checkpoint.misfit(saved.get(key), own[key], key):
+        for key in own:
+            if key != "identity" and (why := checkpoint.misfit(saved.get(key), own[key], key)):
                 raise CheckpointError(f"the checkpoint in {args.out} does not fit this run: {why}")
         (iteration, steps, _), recent, mine = place, saved["recent"].numpy(), saved["processes"][rank]
         policy.load_state_dict(saved["weights"])
@@ -323,7 +323,7 @@ def identity(args) -> dict:
     constants = {f"{type(c).__name__}.{name}": str(value) for c in configs for name, value in asdict(c).items()}
     constants |= {f"weight of {term.__name__}": str(weight) for term, weight in REWARDS.items()}
     constants["faults"] = ", ".join(f"{share:g} {fault}" for share, fault in TASKS[args.task].training)
-    return options | constants
+    return options | constants | {"terrain": str(TASKS[args.task].terrain)}
 
 
 def train_all(words: list[str], args) -> None:
@@ -355,6 +355,8 @@ def main(argv: list[str] | None = None) -> None:
             differing = [f"{key} was {was[key]}, is {now[key]}" for key in now if key in was and was[key] != now[key]]
             if differing:
                 fail(f"the run in {args.out} was another one: {'; '.join(differing)}")
+        elif args.init:  # tried here, where it can be said in one line
+            checkpoint.start_from(args.init, args.robot, make_policy(args.policy, ROBOTS[args.robot], TASKS[args.task]))
     except CheckpointError as error:
         fail(error)
     run(train, args)

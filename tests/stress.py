@@ -3,7 +3,7 @@
     python tests/stress.py kill         # 50 SIGKILLs at random instants, a resume after each       (about 10 minutes)
     python tests/stress.py resume       # stopped at 5 random iterations, {1, 2} processes x {rolt, mlp, rma}     (10)
     python tests/stress.py fuzz         # 300 wrong argument lists and damaged checkpoints                         (3)
-    python tests/stress.py flail        # a million env steps of random actions over every robot and fault        (5)
+    python tests/stress.py flail        # a million env steps of random actions over all robots, faults, terrain  (5)
     python tests/stress.py kill 10 --seed 1      # ten, other ones
 
 Ends with exit code 0 and a line of what was measured, or with an AssertionError. Leaves nothing behind.
@@ -35,8 +35,9 @@ import evaluate  # noqa: E402
 import render  # noqa: E402
 import train  # noqa: E402
 from env import LocomotionEnv  # noqa: E402
-from faults import disable, healthy, lock, weaken  # noqa: E402
+from faults import disable, half_lock, healthy, lock, skate, tow, weaken  # noqa: E402
 from robots import ROBOTS  # noqa: E402
+from terrain import TRAINING_MAP  # noqa: E402
 
 SMALL = ["--envs", "8", "--minibatches", "2", "--save-minutes", "1e-6"]  # a checkpoint after every iteration of 192 steps
 TIMING = ("collect_seconds", "update_seconds")  # the columns of progress.csv that may differ
@@ -84,7 +85,7 @@ def same_run(one: Path, other: Path) -> None:
 
 
 def kill(number: int, dice: random.Random, folder: Path) -> str:
-    """SIGKILL to all processes of a run, a quarter of them while it starts. In the end it is the run that was never killed."""
+    """SIGKILL to all processes of a run, a quarter of them while it starts. It ends as one that was never killed."""
     lost, ends = 0, []
     for threads, kills in ((1, number - number // 4), (2, number // 4)):
         out, whole = folder / f"killed{threads}", folder / f"whole{threads}"
@@ -108,7 +109,7 @@ def kill(number: int, dice: random.Random, folder: Path) -> str:
         finish(start(*words, ends[-1] * 192, "--out", out, "--resume"))
         finish(start(*words, ends[-1] * 192, "--out", whole))
         same_run(out, whole)
-    return f"{number} SIGKILLs in {sum(ends)} iterations: at most {lost} lost by one; the rest as if never killed, to the bit"
+    return f"{number} SIGKILLs in {sum(ends)} iterations: at most {lost} lost by one; the end is the same to the bit"
 
 
 def resume(number: int, dice: random.Random, folder: Path) -> str:
@@ -120,8 +121,9 @@ def resume(number: int, dice: random.Random, folder: Path) -> str:
             whole, broken = folder / f"{policy}{processes}", folder / f"{policy}{processes}-broken"
             finish(start(*words, "--out", whole))
             for k in sorted(dice.sample(range(1, 23), number)):
+                done = iterations(broken)
                 process = start(*words, "--out", broken, *["--resume"] * broken.exists())
-                wait_for(lambda: iterations(broken) >= k, process)
+                wait_for(lambda: iterations(broken) >= max(k, done + 1), process)
                 process.terminate()
                 finish(process)
                 stops.append(saved(broken)["iteration"])
@@ -133,10 +135,11 @@ def resume(number: int, dice: random.Random, folder: Path) -> str:
 
 # ---------------------------------------------------------------------- wrong input
 
-BAD = ["", " ", "-1", "0", "nan", "inf", "-inf", "1e400", "1e30", "1.5", "x", "--", "a1,go1", "٣", "\udcff", "x" * 5000, "0x10", "None"]
+BAD = ["", " ", "-1", "0", "nan", "inf", "-inf", "1e400", "1e30", "1.5", "x", "--", "a1,go1", "٣", "\udcff", "x" * 5000]
+QUICK = ["--episodes", "1", "--seconds", "0.02", "--out", "o"]
 OPTIONS = {
     "train.py": ["--robot", "--task", "--policy", "--envs", "--steps", "--epochs", "--minibatches", "--seed", "--device",
-                 "--threads", "--out", "--save-minutes", "--res", "--unknown"],
+                 "--threads", "--out", "--save-minutes", "--init", "--res", "--unknown"],
     "evaluate.py": ["stiffness", "--robot", "--methods", "--checkpoints", "--episodes", "--seconds", "--seed", "--threads"],
     "render.py": ["--fault", "--seconds", "--speed", "--seed", "--out"],
 }  # fmt: skip
@@ -147,7 +150,7 @@ def wrong_words(dice: random.Random, good: Path) -> list[str]:
     script = dice.choice(list(OPTIONS))
     words = {
         "train.py": ["train.py", "--out", "new", "--steps", "192", "--threads", "1", "--envs", "8", "--minibatches", "2"],
-        "evaluate.py": ["evaluate.py", "stiffness", "--checkpoints", str(good), "--episodes", "1", "--seconds", "0.02", "--out", "o"],
+        "evaluate.py": ["evaluate.py", "stiffness", "--checkpoints", str(good), *QUICK],
         "render.py": ["render.py", str(good), "--seconds", "0.1", "--out", "walk.gif"],
     }[script]  # fmt: skip
     for option in dice.sample(OPTIONS[script], dice.randint(1, 3)):
@@ -165,7 +168,8 @@ def places(value, path=()):
 
 def damage(dice: random.Random, source: Path, target: Path) -> str:
     """Writes `source` to `target` with one thing wrong, either in its bytes or in what it holds. Returns what."""
-    data, how = bytearray(source.read_bytes()), dice.choice(["cut", "flip", "zero", "noise"] + 4 * ["remove", "replace", "tensor"])
+    data = bytearray(source.read_bytes())
+    how = dice.choice(["cut", "flip", "zero", "noise"] + 4 * ["remove", "replace", "tensor"])
     if how in ("cut", "flip", "zero", "noise"):
         at = dice.randrange(len(data))
         if how == "cut":
@@ -184,12 +188,13 @@ def damage(dice: random.Random, source: Path, target: Path) -> str:
         parent = parent[key]
     value = parent[path[-1]]
     if how == "tensor" and isinstance(value, torch.Tensor):
-        wrong = [value[None], value.flatten()[:1], value.to(torch.complex64), value.to(torch.int16), value.float() * float("nan")]
+        wrong = [value[None], value.flatten()[:1], value.to(torch.complex64), value.short(), value.float() * torch.nan]
         parent[path[-1]] = dice.choice(wrong)
     elif how == "remove":
         del parent[path[-1]]
     else:
-        parent[path[-1]] = dice.choice([None, "x", 3, -7, 2.5, float("nan"), True, [], {}, [1], (2,), torch.zeros(3), {"a": 1}, 10**30])
+        wrong = [None, "x", 3, -7, 2.5, torch.nan, True, [], {}, [1], (2,), torch.zeros(3), {"a": 1}, 10**30]
+        parent[path[-1]] = dice.choice(wrong)
     torch.save(content, target)
     return f"{how} {path} to {str(parent)[:100]}"
 
@@ -222,12 +227,12 @@ def fuzz(number: int, dice: random.Random, folder: Path) -> str:
             script = dice.choice(["train.py", "evaluate.py", "render.py"])
             out = Path(f"damaged{i}")
             out.mkdir()
-            source = Path("good") / ("checkpoint.pt" if script == "train.py" else dice.choice(["policy.pt", "checkpoint.pt"]))
+            files = ["checkpoint.pt"] if script == "train.py" else ["policy.pt", "checkpoint.pt"]
+            source = Path("good") / dice.choice(files)
             what = damage(dice, source, out / source.name)
             words = {
                 "train.py": [*train_words, str(out), "--steps", "576", "--resume"],
-                "evaluate.py": ["evaluate.py", "stiffness", "--checkpoints", str(out / source.name), "--episodes", "1",
-                                "--seconds", "0.02", "--out", "o"],
+                "evaluate.py": ["evaluate.py", "stiffness", "--checkpoints", str(out / source.name), *QUICK],
                 "render.py": ["render.py", str(out / source.name), "--seconds", "0.1", "--out", "walk.gif"],
             }[script]  # fmt: skip
         if i % 25 == 0:
@@ -243,15 +248,27 @@ def fuzz(number: int, dice: random.Random, folder: Path) -> str:
 # ---------------------------------------------------------------------- random actions
 
 
+def every_fault(robot) -> tuple[list, list]:
+    """Each kind of fault on each joint or leg; and those that hang something on a leg, which makes for another model."""
+    faults, props = [healthy()], []
+    for leg, pose in zip(robot.legs, robot.default_pose):
+        faults += [kind(f"{leg}_{link.name}") for link in robot.links for kind in (lock, disable)]
+        faults += [weaken(leg, 0.3), half_lock(f"{leg}_{robot.links[-1].name}", pose[-1])]
+        props += [tow(leg), skate(leg)]
+    return faults, props
+
+
 def flail(number: int, dice: random.Random, folder: Path) -> str:
-    """Uniform actions of ten times the usual size, on robots that have every fault there is. Now and then, robots are given a
-    state that is not finite, or nearly so."""
-    n, divergences, given, fastest, steps = 256, 0, 0, 0.0, number // 256 // len(ROBOTS) + 1
+    """Uniform actions of ten times the usual size, on robots that have every fault there is, on flat ground and on terrain.
+    Now and then some are given a state that is not finite, or nearly so."""
+    worlds = [(robot, faults, None) for robot in ROBOTS.values() for faults in every_fault(robot)]
+    worlds += [(robot, every_fault(robot)[0], TRAINING_MAP) for robot in ROBOTS.values()]
+    n, divergences, given, steps = 256, 0, 0, number // 256 // len(worlds) + 1
     started = time.monotonic()
-    for robot in ROBOTS.values():
-        faults = [healthy(), *(f(joint) for joint in robot.joints for f in (lock, disable)), *(weaken(leg, 0.3) for leg in robot.legs)]
-        odds = tuple((1 / len(faults), fault) for fault in faults)
-        env = LocomotionEnv(robot, n, dice.randrange(1000), 0, odds, extras=("privileged", "past", "situation"))
+    for robot, faults, terrain in worlds:
+        fastest, odds = 0.0, tuple((1 / len(faults), fault) for fault in faults)
+        extras = ("privileged", "past", "situation")
+        env = LocomotionEnv(robot, n, dice.randrange(1000), 0, odds, extras=extras, terrain=terrain)
         env.reset(random_ages=True)
         rng = np.random.default_rng(dice.randrange(1000))
         for step in range(steps):
@@ -268,12 +285,10 @@ def flail(number: int, dice: random.Random, folder: Path) -> str:
                 assert np.isfinite(x).all(), (robot.name, step, name)
             fastest = max(fastest, np.abs(env._qvel).max())
         divergences += env.divergences
-        print(f"{robot.name}: {steps * n:,} steps, {env.divergences} divergences", flush=True)
-    rate = len(ROBOTS) * steps * n / (time.monotonic() - started)
-    return (
-        f"{len(ROBOTS) * steps * n:,} steps ({rate:,.0f}/s), all finite: {divergences} divergences, {given} of them given; fastest "
-        f"{fastest:.0f} m/s or rad/s"
-    )
+        what = f"{robot.name}, {faults[-1]} and others, {'terrain' if terrain else 'flat'}"
+        print(f"{what}: {env.divergences} divergences, fastest {fastest:.0f} m/s or rad/s", flush=True)
+    total, seconds = len(worlds) * steps * n, time.monotonic() - started
+    return f"{total:,} steps, {total / seconds:,.0f}/s, all finite: {divergences} divergences, {given} of them given"
 
 
 if __name__ == "__main__":

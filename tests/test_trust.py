@@ -112,14 +112,17 @@ def test_ctrl_c_twice_while_saving_does_no_harm(tmp_path, monkeypatch, capsys):
     assert "stopped at 384 steps and saved" in capsys.readouterr().out and signal.getsignal(signal.SIGINT) is before
 
 
-def test_a_full_disk_ends_the_run_in_one_line(trained, tmp_path, monkeypatch, capsys):
-    def full(content, path):
-        raise OSError(28, "No space left on device")
+def test_a_full_disk_ends_the_run_in_one_line(tmp_path, monkeypatch, capsys):
+    def full(content, file):
+        file.write(b"half of it")
+        raise RuntimeError("[enforce fail at inline_container.cc:672] . unexpected pos 4854400 vs 4854292")
 
-    monkeypatch.setattr(checkpoint, "save", full)
+    monkeypatch.setattr(torch, "save", full)
     with pytest.raises(SystemExit) as ended:
         train.main([*COMMON, "--steps", "192", "--out", str(tmp_path)])
-    assert ended.value.code == 1 and capsys.readouterr().err == "error: [Errno 28] No space left on device\n"
+    error = f"error: cannot write {tmp_path}/policy.pt: there is no room for it; what was saved there before is untouched\n"
+    assert ended.value.code == 1 and capsys.readouterr().err == error
+    assert sorted(file.name for file in tmp_path.iterdir()) == [".lock", "progress.csv"]
 
 
 def ends_badly(rank, args, sync, stop):
@@ -131,14 +134,14 @@ def ends_badly(rank, args, sync, stop):
     time.sleep(300)
 
 
-@pytest.mark.parametrize("how, code, says", [("killed", 1, "was ended by SIGKILL"), ("diverged", 1, "decoder.bias is not finite")])
-def test_if_a_process_dies_so_do_the_others(how, code, says, tmp_path, capfd):
+@pytest.mark.parametrize("how, says", [("killed", "was ended by SIGKILL"), ("diverged", "decoder.bias is not finite")])
+def test_if_a_process_dies_so_do_the_others(how, says, tmp_path, capfd):
     (tmp_path / "checkpoint.pt").touch()
     started = time.monotonic()
     with pytest.raises(SystemExit) as ended:
         processes.run(ends_badly, SimpleNamespace(processes=2, out=tmp_path, how=how))
     error = capfd.readouterr().err
-    assert ended.value.code == code and time.monotonic() - started < 120
+    assert ended.value.code == 1 and time.monotonic() - started < 280
     assert error.count("\n") == 1 and says in error and "--resume goes on" in error
 
 
@@ -153,6 +156,7 @@ def test_a_diverged_robot_never_reaches_the_buffer(tmp_path, monkeypatch):
     monkeypatch.setattr(train.LocomotionEnv, "step", broken)
     train.main([*COMMON, "--steps", "192", "--out", str(tmp_path)])
     rows = (tmp_path / "progress.csv").read_text().splitlines()
-    assert dict(zip(rows[0].split(","), rows[1].split(",")))["divergences"] == "48"  # the normalizer's rollout, and the first
+    divergences = dict(zip(rows[0].split(","), rows[1].split(",")))["divergences"]
+    assert divergences == "48"  # 24 steps for the normalizer, and 24
     weights = checkpoint.load(tmp_path / "policy.pt")["weights"].values()
     assert all(torch.isfinite(x).all() for x in weights)
