@@ -355,8 +355,6 @@ def main(argv: list[str] | None = None) -> None:
             differing = [f"{key} was {was[key]}, is {now[key]}" for key in now if key in was and was[key] != now[key]]
             if differing:
                 fail(f"the run in {args.out} was another one: {'; '.join(differing)}")
-        elif args.init:  # tried here, where it can be said in one line
-            checkpoint.start_from(args.init, args.robot, make_policy(args.policy, ROBOTS[args.robot], TASKS[args.task]))
     except CheckpointError as error:
         fail(error)
     run(train, args)
