@@ -207,6 +207,7 @@ def _add_wheel(body, leg: str, foot, radius: float):
     _set_inertia(wheel, WHEEL_MASS, (0, 0, 0), (moment, moment, moment, 0, 0, 0))
     wheel.add_joint(
         name=f"{leg}_wheel", axis=(0, 1, 0), frictionloss=BRAKE,
+        armature=1e-4,  # a rim as heavy as 0.25 kg: a lighter wheel runs away when a robot flails
         solref_friction=[2 * PHYSICS_DT, 1], solimp_friction=[0.9999, 0.9999, 0.001, 0.5, 2],  # or else the brake creeps
     )  # fmt: skip
     return wheel
