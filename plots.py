@@ -50,13 +50,15 @@ def bar_charts(
 
     panels: {axis label: {method: (means, standard deviations), each in the order of `cases`}}.
     """
-    figure, axes = plt.subplots(1, len(panels), figsize=(5.2 * len(panels), 3.8), layout="constrained", squeeze=False)
+    panel_width = max(5.2, 0.6 * len(cases))
+    figure, axes = plt.subplots(1, len(panels), figsize=(panel_width * len(panels), 3.8), layout="constrained", squeeze=False)
     for axis, (label, methods) in zip(axes[0], panels.items()):
         width = 0.8 / len(methods)
         for i, (method, (mean, deviation)) in enumerate(methods.items()):
             x = np.arange(len(cases)) + (i - (len(methods) - 1) / 2) * width
             axis.bar(x, mean, width, yerr=deviation, capsize=2, label=method, error_kw={"linewidth": 0.8})
         axis.set_xticks(np.arange(len(cases)), [case.replace(" (", "\n(") for case in cases], fontsize=8)
+        axis.set_xlim(-0.6, len(cases) - 0.4)
         axis.set_ylabel(label)
         axis.set_ylim(bottom=min(0, axis.get_ylim()[0]))
         axis.grid(axis="y", alpha=0.3)
@@ -118,7 +120,7 @@ def scans(panels: dict[str, np.ndarray], picture: Path, title: str) -> None:
 def attention_maps(panels: dict[str, dict[str, np.ndarray]], picture: Path) -> None:
     """A row a situation: its (16, 12) heights, then the (12,) attention of each method on the 4 x 3 patches."""
     rows, columns = len(panels), max(len(row) for row in panels.values())
-    figure, axes = plt.subplots(rows, columns, figsize=(2.6 * columns, 3.4 * rows), layout="constrained", squeeze=False)
+    figure, axes = plt.subplots(rows, columns, figsize=(2.6 * columns, 2.9 * rows), layout="constrained", squeeze=False)
     for line, (situation, row) in zip(axes, panels.items()):
         for axis, (name, values) in zip(line, row.items()):
             heights = name == "heights"

@@ -108,7 +108,7 @@ def draw(walk: Walk, robot: int, steps: range, width: int = 480, height: int = 3
     renderer = make_renderer(model, width, height)
     data, camera, frames = mujoco.MjData(model), mujoco.MjvCamera(), []
     camera.distance = 1.3 * max(1.0, walk.env.robot.trunk_box[0] / 0.38)  # m, the whole robot
-    camera.azimuth, camera.elevation = 125, -18
+    camera.azimuth, camera.elevation = 60 if walk.env.terrain else 125, -18  # from behind, stairs show their steps
     for step in steps:
         data.qpos[:] = walk.poses[step, robot]
         mujoco.mj_kinematics(model, data)
@@ -159,7 +159,7 @@ def main(argv: list[str] | None = None) -> None:
     parser = Parser(__doc__)
     parser.add_argument("checkpoint", type=Path)
     parser.add_argument("--fault", nargs="+", default=["healthy"], help="a row of the strip each; a GIF shows the first")
-    parser.add_argument("--seconds", type=partial(positive, most=120), default=4.0, help="of a GIF (default 4)")
+    parser.add_argument("--seconds", type=partial(positive, most=120), help="default: 4 in a GIF, 0.6 in a strip")
     parser.add_argument("--speed", type=partial(positive, most=10), default=0.75, help="commanded, m/s")
     parser.add_argument("--seed", type=seed, default=0)
     parser.add_argument("--stairs", type=int, choices=range(-2, 11), metavar="LEVEL", help="-2 to 10, instead of flat ground")
@@ -174,10 +174,12 @@ def main(argv: list[str] | None = None) -> None:
         terrain = None if args.stairs is None else Terrain(("stairs",), (args.stairs,) * 9)
         options = {"speed": args.speed, "seed": args.seed, "terrain": terrain}
         if args.out.suffix == ".gif":
-            frames = film(policy, card["robot"], faults[0], args.seconds, 2, **options)
+            frames = film(policy, card["robot"], faults[0], args.seconds or 4.0, 2, **options)
             write_gif(frames, args.out, 2 * CONTROL_DT)
         else:
-            rows = {str(f): film(policy, card["robot"], f, 0.6, 5, 300, 240, **options) for f in faults}
+            seconds = args.seconds or 0.6
+            every = max(1, round(seconds / CONTROL_DT / 6))  # six frames
+            rows = {str(f): film(policy, card["robot"], f, seconds, every, 300, 240, **options) for f in faults}
             write_strip(rows, args.out)
     except (CheckpointError, OSError, FloatingPointError, ValueError, RuntimeError) as error:
         fail(error)

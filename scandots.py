@@ -34,3 +34,9 @@ def scan(terrain: Terrain | None, position: np.ndarray, yaw: np.ndarray, shift: 
         ground = terrain.height(x + cos * forward - sin * left, y + sin * forward + cos * left)
     height = position[:, 2, None, None] - 0.5 - (ground + up)
     return (HEIGHT_SCALE * np.clip(height, -1, 1)).astype(np.float32)
+
+
+def as_patches(points: np.ndarray) -> np.ndarray:
+    """(16, 12) -> (12, 16): the points of each patch, in ROLT's order, row by row."""
+    rows, columns = (size // PATCH for size in SCAN_SHAPE)
+    return points.reshape(rows, PATCH, columns, PATCH).swapaxes(1, 2).reshape(NUM_PATCHES, PATCH**2)
