@@ -152,7 +152,8 @@ def test_noise_tests_and_attention_on_stairs(tmp_path, capsys):
         evaluate.main([name, *test])
         assert [row["case"] for row in rows(tmp_path / f"{name}.csv")][::2] == ["0", "0.05", "0.1", "0.2", "0.4", "0.8"]
     evaluate.main(["attention", *test])
-    assert capsys.readouterr().out.count("entropy 1.00") == 4  # a gaze that has learned nothing is even
+    entropies = [float(line.split()[-1]) for line in capsys.readouterr().out.splitlines() if "entropy" in line]
+    assert len(entropies) == 4 and min(entropies) > 0.95  # a gaze that has learned nothing is even
     assert all((tmp_path / f"{name}.png").stat().st_size > 1000 for name in ("low_frequency", "high_frequency", "attention"))
 
 
