@@ -77,11 +77,12 @@ def time_simulation(robot: str, num_envs: int, threads: int, steps: int, terrain
     total, bare, scan, rng = [], [], [], np.random.default_rng(0)
     env.world.step, env.scan.read = timed(env.world.step, bare), timed(env.scan.read, scan)
     step = timed(env.step, total)
-    for _ in range(steps + 10):
-        if len(total) == 10:  # warm
+    for i in range(steps + 10):
+        if i == 10:  # warm
             for times in (total, bare, scan):
                 times.clear()
         step(0.5 * rng.normal(size=(num_envs, env.num_actions)))
+    del env.world.step, env.scan.read  # or the world and its threads would never go: they hold themselves
     return {
         "env_step_ratio": sum(bare) / sum(total),
         "scandots_ratio": sum(scan) / sum(total),
@@ -180,6 +181,7 @@ def time_training(robot: str, name: str, num_envs: int, rank: int) -> dict[str, 
         buffer = RolloutBuffer(T, observation, env.num_actions, masks, "cpu")
         observation, _ = timed(collect, acting)(env, policy, critic, buffer, observation, generator)
         timed(learner.update, update)(buffer, generator)
+    del env.step  # as above
     return {"simulate": sum(simulate), "act": sum(acting) - sum(simulate), "update": sum(update)}
 
 
