@@ -3,6 +3,7 @@
     python train.py --robot a1                            # ROLT on the stiffness task, a few hours on two cores
     python train.py --robot a1 --steps 20000              # does it run? a minute
     python train.py --robot a1 --resume                   # goes on where it was stopped (Ctrl-C is safe)
+    python train.py --robot a1 --task terrain --init runs/a1-stiffness-rolt-seed0/checkpoint.pt    # stairs, after flat ground
     python train.py --robot a1 --policy all               # every method of the paper in turn; skips what is finished
     python train.py --robot a1 --paper --device cuda      # the paper's size: 4096 robots, 400 million steps
     torchrun --nproc-per-node=2 train.py --robot a1 --paper --device cuda    # on two GPUs; on two machines with --nnodes=2
