@@ -168,7 +168,7 @@ class LocomotionEnv:
         self.episode_return = np.zeros(num_envs)
         self.divergences = 0  # simulations that were given up, in total
         self.row, self.start = np.zeros(num_envs, dtype=int), np.zeros((num_envs, 2))  # where on the terrain it began, m
-        self.column = np.arange(num_envs) % len(terrain.columns if terrain else "1")
+        self.column = np.arange(num_envs) % (len(terrain.columns) if terrain else 1)
 
     # ------------------------------------------------------------------ interface
 

@@ -28,7 +28,7 @@ import watch  # first: it says how to draw without a display, which mujoco reads
 from baselines import METHODS
 from checkpoint import CheckpointError, load_policy
 from cli import Parser, count, fail, num_cores, positive, seed, threads, writable_folder
-from env import CONTROL_DT, EnvConfig, LocomotionEnv
+from env import CONTROL_DT, LocomotionEnv
 from faults import REAL_WORLD, TASKS, healthy
 from gaits import gaits
 from noise import ScanNoise, missing_points
@@ -36,7 +36,7 @@ from paper import DAMAGE
 from paper import REAL_WORLD as REAL_WORLD_PAPER
 from plots import attention_maps, ratio_bands
 from ppo import Critic, PPOConfig, RolloutBuffer, collect, gaussian, to_tensors
-from protocol import case_name, report, report_curves, run_cases, write_csv
+from protocol import case_name, report, report_curves, run_cases, straight_ahead, write_csv
 from rolt import ROLT
 from scandots import HEIGHT_SCALE, NUM_PATCHES, as_patches
 from terrain import Terrain, rise
@@ -122,8 +122,8 @@ def attention(args) -> None:
     heads, made to add up to 1. Printed: the share of it on those 4 patches, and its entropy relative to an even gaze.
     """
     walker, _ = list(args.policies.values())[-1]
-    config = EnvConfig(forward_speed=(0.5, 0.5), heading=(0.0, 0.0), push_speed=0.0, start_rows=1, climb=False)
-    env = LocomotionEnv(args.robot, 1, args.seed, 1, config=config, terrain=Terrain(("stairs",), (STAIRS_LEVEL,) * 3))
+    course = {"config": straight_ahead(0.5, 4.0), "terrain": Terrain(("stairs",), (STAIRS_LEVEL,) * 3)}
+    env = LocomotionEnv(args.robot, 1, args.seed, 1, **course)
     observation = env.reset()
     for _ in range(round(4 / CONTROL_DT)):
         observation, *_ = env.step(walker(to_tensors(observation, "cpu")).numpy())

@@ -17,7 +17,6 @@ from pathlib import Path
 
 import numpy as np
 
-from plots import scans
 from scandots import HEIGHT_SCALE, NUM_PATCHES, PATCH, SCAN_SHAPE, scan
 from terrain import Terrain
 
@@ -123,6 +122,8 @@ class NoisyScan:
 
 
 def main() -> None:
+    from plots import scans  # not above: training needs no matplotlib for its noise
+
     stairs, rng = Terrain(("stairs",), (3,)), np.random.default_rng(0)
     position, yaw = np.array([[1.4, 0.0, 0.45]]), np.zeros(1)  # where a robot stands on the third step
     low, high = ScanNoise(offset=0.3), ScanNoise(sigma=0.1)

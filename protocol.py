@@ -16,26 +16,28 @@ from plots import bar_charts, curves
 from ppo import to_tensors
 
 
+def straight_ahead(speed: float, seconds: float) -> EnvConfig:
+    """What tests and pictures ask of a robot: to walk straight on at `speed` m/s from the terrain's first row. Starts vary as
+    in training (pose, velocity, friction), nobody is pushed, and nobody times out within `seconds`."""
+    return EnvConfig(
+        episode_seconds=seconds + 1.0, forward_speed=(speed, speed), heading=(0.0, 0.0), push_speed=0.0,
+        start_rows=1, climb=False,
+    )  # fmt: skip
+
+
 @torch.no_grad()
 def run_episodes(
     policy, robot: str, faults: list[Fault], speed: float, seconds: float, seed: int = 0, threads: int = 0, **env_options
 ) -> dict[str, np.ndarray]:
-    """One episode on each of len(faults) robots, robot i with faults[i], told to walk straight on at `speed`.
+    """One episode `straight_ahead` on each of len(faults) robots, robot i with faults[i].
 
-    env_options: of LocomotionEnv, such as terrain (robots start on its first row) and noise.
-
-    Starts vary as in training (pose, velocity, friction); nobody is pushed. A fall is what ends an episode in
-    training: the trunk touches the ground or tilts by more than 60 degrees.
+    env_options: of LocomotionEnv, such as terrain and noise. A fall is what ends an episode in training: the trunk touches
+    the ground or tilts by more than 60 degrees.
 
     Returns (N,) each: distance_m, net displacement along the commanded heading up to the first fall or the end;
     fall_time_s, of the first fall, `seconds` if there is none; episode_return, the reward up to then.
     """
-    config = EnvConfig(
-        episode_seconds=seconds + 1.0,  # nobody times out before we stop
-        forward_speed=(speed, speed), lateral_speed=(0.0, 0.0), heading=(0.0, 0.0), push_speed=0.0,
-        start_rows=1, climb=False,
-    )  # fmt: skip
-    situations = [(1.0, fault) for fault in faults]
+    situations, config = [(1.0, fault) for fault in faults], straight_ahead(speed, seconds)
     env = LocomotionEnv(robot, len(faults), seed, threads, situations, config, policy.extras, **env_options)
     env.pin_faults(faults)  # one each
     observation = env.reset()

@@ -25,9 +25,10 @@ from PIL import Image, ImageDraw  # noqa: E402
 
 from checkpoint import CheckpointError, load_policy  # noqa: E402
 from cli import Parser, fail, positive, seed, writable_folder  # noqa: E402
-from env import CONTROL_DT, EnvConfig, LocomotionEnv  # noqa: E402
+from env import CONTROL_DT, LocomotionEnv  # noqa: E402
 from faults import Fault, joint_mask, parse  # noqa: E402
 from ppo import to_tensors  # noqa: E402
+from protocol import straight_ahead  # noqa: E402
 from terrain import Terrain  # noqa: E402
 
 
@@ -71,10 +72,7 @@ def record(
 
     env_options: of LocomotionEnv, such as terrain and noise.
     """
-    config = EnvConfig(
-        forward_speed=(speed, speed), heading=(0.0, 0.0), push_speed=0.0, episode_seconds=seconds + 1.0, start_rows=1
-    )
-    situations = [(1.0, fault) for fault in faults]
+    situations, config = [(1.0, fault) for fault in faults], straight_ahead(speed, seconds)
     env = LocomotionEnv(robot, len(faults), seed, threads, situations, config, policy.extras, **env_options)
     env.pin_faults(faults)  # one each
     observation, poses, contacts = env.reset(), [], []

@@ -26,11 +26,12 @@ import torch
 
 from checkpoint import CheckpointError, load_policy
 from cli import Parser, fail, positive, seed, writable_folder
-from env import CONTROL_DT, EnvConfig, LocomotionEnv
+from env import CONTROL_DT, LocomotionEnv
 from faults import REAL_WORLD, TASKS, Fault, healthy, parse, props, write_fault
 from noise import ScanNoise
 from noise import parse as parse_noise
 from ppo import to_tensors
+from protocol import straight_ahead
 from robots import ROBOTS
 from terrain import Terrain
 
@@ -55,8 +56,7 @@ class Show:
 
     def start(self) -> None:
         """A new episode in a new env."""
-        config = EnvConfig(heading=(0.0, 0.0), push_speed=0.0, episode_seconds=3600, start_rows=1, climb=False)
-        options = {"config": config, "extras": self.policy.extras, "terrain": self.terrain, "noise": self.noise}
+        options = {"config": straight_ahead(self.speed, 3600), "extras": self.policy.extras, "terrain": self.terrain, "noise": self.noise}
         self.env = LocomotionEnv(self.robot, 1, self.seed, 1, [(1.0, self.fault)], **options)
         self.observation = self.env.reset()
         self.model = render.painted(self.env, self.fault)

@@ -27,9 +27,10 @@ def test_bit_identical_for_a_seed_at_any_number_of_threads():
     assert not all(np.array_equal(a, b) for a, b in zip(one, other))
 
 
-def test_goes_on_to_the_bit_after_a_break():
+@pytest.mark.parametrize("task", [TASKS["stiffness"], TASKS["terrain"]], ids=["flat", "terrain"])
+def test_goes_on_to_the_bit_after_a_break(task):
     def make():
-        return LocomotionEnv("a1", 6, 2, 1, TASKS["stiffness"].training, EnvConfig(episode_seconds=0.5))
+        return LocomotionEnv("a1", 6, 2, 1, task.training, EnvConfig(episode_seconds=0.5), terrain=task.terrain)
 
     env, rng = make(), np.random.default_rng(0)
     env.reset(random_ages=True)
