@@ -145,16 +145,15 @@ def load_policy(path: str | Path, robot: str | None = None) -> tuple[torch.nn.Mo
     return policy.eval(), card
 
 
-def start_from(path: str | Path, robot: str, policy: torch.nn.Module, critic: torch.nn.Module) -> None:
+def start_from(path: str | Path, policy: torch.nn.Module, critic: torch.nn.Module) -> None:
     """Puts the weights in the file into a fresh policy and, if it is a checkpoint.pt, into a fresh critic.
 
-    The file may be of another method whose weights include all of the policy's (ROLT's fit the ablations of its dropout).
+    The file may be of another method whose weights include all of the policy's (ROLT's fit the ablations of its dropout),
+    and of another robot with as many legs and joints (an A1's fit a Go1).
     What the normalizers measured is kept until the first rollout of the new run replaces it.
     CheckpointError if the file cannot be used.
     """
     content = load(path)
-    if content.get("robot") != robot:
-        raise CheckpointError(f"{path} was trained on the {content.get('robot')}, not on the {robot}")
     try:
         missing, _ = policy.load_state_dict(content["weights"], strict=False)
         if missing:

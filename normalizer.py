@@ -30,6 +30,10 @@ class Normalizer(nn.Module):
         for name, width in (("legs", 3 * num_joints + 12), ("heights", 1), ("privileged", num_privileged)):
             self.register_buffer(f"{name}_mean", torch.zeros(width, dtype=torch.float64))
             self.register_buffer(f"{name}_square", torch.ones(width, dtype=torch.float64))  # mean of the squares
+            for kind in ("shift", "deviation"):  # what `forward` needs of them, ready made
+                self.register_buffer(f"{name}_{kind}", torch.zeros(width), persistent=False)
+        self.refresh()
+        self.register_load_state_dict_post_hook(lambda module, _: module.refresh())
 
     def forward(self, observation: Observation) -> Observation:
         J, action = self.num_joints, observation.action
@@ -43,9 +47,15 @@ class Normalizer(nn.Module):
         return observation
 
     def _scale(self, x: Tensor, name: str, columns: slice = slice(None)) -> Tensor:
-        mean, square = getattr(self, f"{name}_mean"), getattr(self, f"{name}_square")
-        deviation = (square - mean**2).clamp(min=MIN_DEVIATION**2).sqrt()
-        return ((x - mean[columns].to(x.dtype)) / deviation[columns].to(x.dtype)).clamp(-CLIP, CLIP)
+        shift, deviation = getattr(self, f"{name}_shift"), getattr(self, f"{name}_deviation")
+        return ((x - shift[columns]) / deviation[columns]).clamp(-CLIP, CLIP)
+
+    def refresh(self) -> None:
+        """To be called when the statistics have changed."""
+        for name in ("legs", "heights", "privileged"):
+            mean, square = getattr(self, f"{name}_mean"), getattr(self, f"{name}_square")
+            getattr(self, f"{name}_shift").copy_(mean)
+            getattr(self, f"{name}_deviation").copy_((square - mean**2).clamp(min=MIN_DEVIATION**2).sqrt())
 
     @torch.no_grad()
     def update(self, observation: Observation, sum_over_processes) -> None:
@@ -67,3 +77,4 @@ class Normalizer(nn.Module):
                 running = getattr(self, f"{name}_{kind}")
                 running += share * (value - running)
         self.count += total
+        self.refresh()

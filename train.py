@@ -208,7 +208,7 @@ def train(rank: int, args, sync: str | None, stop: list) -> None:
     generator = torch.Generator(device).manual_seed(args.seed * 1_000_003 + rank)  # actions, masks, minibatches
     part = Part(0, stages[0], args, rank, policy, device)
     if args.init and not args.resume:
-        checkpoint.start_from(args.init, args.robot, policy, part.critic)
+        checkpoint.start_from(args.init, policy, part.critic)
     iteration, steps = 0, 0
     recent = np.zeros((20, len(EPISODES)))  # of the last iterations: episodes end now and then
 

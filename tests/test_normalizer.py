@@ -33,6 +33,13 @@ def test_mean_and_deviation_of_all_that_was_seen():
     assert abs(seen.privileged.mean()) < 0.5 and abs(seen.past.mean()) < 0.5
 
 
+def test_a_loaded_normalizer_answers_as_the_saved_one():
+    saved, loaded, x = Normalizer(3), Normalizer(3), observation(0)
+    saved.update(x, alone)
+    loaded.load_state_dict(saved.state_dict())
+    assert torch.equal(loaded(x).legs, saved(x).legs) and not torch.equal(Normalizer(3)(x).legs, saved(x).legs)
+
+
 def test_two_processes_see_what_one_would():
     whole, half = Normalizer(3), Normalizer(3)
     left, right = observation(0), observation(1)

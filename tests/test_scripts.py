@@ -146,6 +146,10 @@ def test_noise_tests_and_attention_on_stairs(tmp_path, capsys):
     with pytest.raises(SystemExit):
         train.main([*quick, "--task", "terrain", "--out", str(tmp_path / "mlp"), "--init", f"{flat}/policy.pt", "--policy", "mlp"])
     assert "do not fit this policy" in capsys.readouterr().err
+    train.main([*quick, "--robot", "go1", "--out", str(tmp_path / "go1"), "--init", f"{flat}/checkpoint.pt"])  # as many joints
+    with pytest.raises(SystemExit):
+        train.main([*quick, "--robot", "hexapod", "--out", str(tmp_path / "hexapod"), "--init", f"{flat}/policy.pt"])
+    assert "do not fit this policy" in capsys.readouterr().err
     files = [f"{stairs}/policy.pt", f"{ablation}/policy.pt"]
     test = ["--checkpoints", *files, "--episodes", "1", "--seconds", "0.1", "--threads", "1", "--out", str(tmp_path)]
     for name in ("low_frequency", "high_frequency"):
