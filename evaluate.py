@@ -7,7 +7,7 @@
     python evaluate.py real_world                         # a Go1 with a weak leg, a box in tow, skates
     python evaluate.py gaits --robot a1                   # which foot is on the ground when
     python evaluate.py dropout_ratio                      # why the dropout masks are stored
-    python evaluate.py stiffness --methods rolt --episodes 8 --seconds 10 --out /tmp/quick
+    python evaluate.py stiffness --methods rolt --episodes 8 --seconds 10 --out /tmp/quick --video /tmp/quick/stiffness.gif
 
     python evaluate.py watch --robot a1 --fault lock:FR_calf     # a viewer; see watch.py, or watch --help
 
@@ -37,6 +37,7 @@ from paper import REAL_WORLD as REAL_WORLD_PAPER
 from plots import attention_maps, ratio_bands
 from ppo import Critic, PPOConfig, RolloutBuffer, collect, gaussian, to_tensors
 from protocol import case_name, report, report_curves, run_cases, straight_ahead, write_csv
+from render import film_cases
 from rolt import ROLT
 from scandots import HEIGHT_SCALE, NUM_PATCHES, as_patches
 from terrain import Terrain, rise
@@ -122,8 +123,9 @@ def attention(args) -> None:
     heads, made to add up to 1. Printed: the share of it on those 4 patches, and its entropy relative to an even gaze.
     """
     walker, _ = list(args.policies.values())[-1]
-    course = {"config": straight_ahead(0.5, 4.0), "terrain": Terrain(("stairs",), (STAIRS_LEVEL,) * 3)}
-    env = LocomotionEnv(args.robot, 1, args.seed, 1, **course)
+    course = Terrain(("stairs",), (STAIRS_LEVEL,) * 3)
+    env = LocomotionEnv(args.robot, 1, args.seed, 1, config=straight_ahead(0.5, 4.0), terrain=course)
+    args.scenes["clean"] = (healthy(), 0.5, {"terrain": course})
     observation = env.reset()
     for _ in range(round(4 / CONTROL_DT)):
         observation, *_ = env.step(walker(to_tensors(observation, "cpu")).numpy())
@@ -249,6 +251,16 @@ def find_policies(args) -> dict[Path, tuple]:
     return policies
 
 
+def video(args) -> None:
+    """Of the last method, ROLT, if there is one."""
+    policy, _ = list(args.policies.values())[-1]
+    try:
+        film_cases(policy, args.robot, args.scenes, min(4.0, args.seconds), args.video, args.seed)
+    except RuntimeError as error:
+        fail(f"the numbers are written, the video is not: {error}")
+    print(f"written: {args.video}")
+
+
 def main(argv: list[str] | None = None) -> None:
     words = sys.argv[1:] if argv is None else argv
     if words[:1] == ["watch"]:
@@ -264,7 +276,11 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--seed", type=seed, default=0, help="of the starts")
     parser.add_argument("--threads", type=threads, default=num_cores(), help="cores to use (default: all)")
     parser.add_argument("--out", type=Path, default=Path("results"), help="folder of the CSV file and the picture")
+    parser.add_argument("--video", type=Path, metavar="FILE.gif", help="also film the last method in every case, its first 4 s")
     args = parser.parse_args(argv)
+    args.scenes = {}  # {case: (fault, speed, options of the env)}, for the film
+    if args.video and (args.video.suffix != ".gif" or args.experiment == "dropout_ratio"):
+        fail("--video is a .gif file, and for tests in which a robot walks (all but dropout_ratio)")
     function, task, suitable = EXPERIMENTS[args.experiment]
     robots = tuple(dict.fromkeys(robot for name in ([task] if task else TASKS) for robot in TASKS[name].robots))
     defaults = DEFAULTS.get(args.experiment, {})
@@ -281,9 +297,13 @@ def main(argv: list[str] | None = None) -> None:
     if unsuitable:
         fail(f"{args.experiment} is for {', '.join(suitable)}, not for {', '.join(sorted(unsuitable))}")
     writable_folder(args.out)
+    if args.video:
+        writable_folder(args.video.parent)
     torch.set_num_threads(args.threads)
     try:
         function(args)
+        if args.video:
+            video(args)
     except (OSError, FloatingPointError) as error:  # a full disk; weights so large that actions are not finite
         fail(error)
 

@@ -69,6 +69,7 @@ def gaits(args) -> None:
     task, robot = TASKS[args.task], ROBOTS[args.robot]
     cases = {case_name(fault): fault for fault in (*(fault for _, fault in task.training), *task.unseen)}
     labels = [(case, episode) for case in cases for episode in range(args.episodes)]
+    args.scenes |= {case: (fault, 0.75, {}) for case, fault in cases.items()}
     rows, panels, problem = [], [], render.problem()
     if problem:
         print(f"no frames, numbers only: {problem}")

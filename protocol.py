@@ -65,7 +65,9 @@ def case_name(fault: Fault) -> str:
 
 
 def run_cases(args, cases: dict[str, Fault], speed: float, **env_options) -> list[dict]:
-    """Every checkpoint on every case, `args.episodes` robots each: the rows of the CSV file."""
+    """Every checkpoint on every case, `args.episodes` robots each: the rows of the CSV file. What --video would show of it is
+    noted in `args.scenes`."""
+    args.scenes |= {case: (fault, speed, env_options) for case, fault in cases.items()}
     faults = [fault for fault in cases.values() for _ in range(args.episodes)]
     labels = [(case, episode) for case in cases for episode in range(args.episodes)]
     rows = []

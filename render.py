@@ -7,18 +7,25 @@ Works without a display through EGL (set MUJOCO_GL yourself for another way, suc
 """
 
 import copy
+import math
 import os
 import sys
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
-TOO_LATE = False
+BROKEN = None  # why there can be no pictures, if it is known from the start
 if sys.platform == "linux" and not os.environ.get("DISPLAY") and "MUJOCO_GL" not in os.environ:
-    TOO_LATE = "mujoco" in sys.modules  # which reads the variable when it is imported
+    if "mujoco" in sys.modules:  # which reads the variable when it is imported
+        BROKEN = "import render before anything that imports mujoco, or set MUJOCO_GL=egl"  # drawing would end the process
     os.environ["MUJOCO_GL"] = "egl"
-
-import mujoco  # noqa: E402
+LIBRARIES = "try MUJOCO_GL=egl (package libegl1) or osmesa (libosmesa6)"
+try:
+    import mujoco
+except Exception as error:  # the library of MUJOCO_GL is missing, each fails in its own way; all but pictures works without
+    BROKEN = f"MUJOCO_GL is {os.environ.get('MUJOCO_GL', 'not set')}, which does not load ({error}); {LIBRARIES}"
+    os.environ["MUJOCO_GL"] = "disable"
+    import mujoco
 import numpy as np  # noqa: E402
 import torch  # noqa: E402
 from PIL import Image, ImageDraw  # noqa: E402
@@ -34,15 +41,13 @@ from terrain import Terrain  # noqa: E402
 
 def make_renderer(model: mujoco.MjModel, width: int, height: int) -> mujoco.Renderer:
     """RuntimeError with the way out where off-screen rendering does not work."""
-    if TOO_LATE:  # it would not raise an error but end the process
-        raise RuntimeError("cannot render: import render before anything that imports mujoco, or set MUJOCO_GL=egl")
+    if BROKEN:
+        raise RuntimeError(f"cannot render: {BROKEN}")
     try:
         return mujoco.Renderer(model, height, width)
     except Exception as error:  # each backend fails in its own way
         way = os.environ.get("MUJOCO_GL", "not set")
-        raise RuntimeError(
-            f"cannot render ({error}): MUJOCO_GL is {way}; try MUJOCO_GL=egl (package libegl1) or osmesa (libosmesa6)"
-        ) from error
+        raise RuntimeError(f"cannot render ({error}): MUJOCO_GL is {way}; {LIBRARIES}") from error
 
 
 def problem() -> str | None:
@@ -130,6 +135,28 @@ def film(
     if not steps:
         raise ValueError(f"with {fault} the robot falls within {warm_up:g} s: there is nothing to show")
     return draw(walk, 0, steps, width, height)
+
+
+def film_cases(
+    policy, robot: str, cases: dict[str, tuple[Fault, float, dict]], seconds: float, path: Path, seed: int = 0
+) -> None:
+    """A GIF of one robot a case, side by side from the start; who falls stays as it fell.
+
+    cases: {name: (fault, commanded speed, options of LocomotionEnv)}
+    """
+    width, height, every, films = 240, 160, 4, {}
+    for name, (fault, speed, env_options) in cases.items():
+        walk = record(policy, robot, [fault], seconds, speed, seed, **env_options)
+        films[name] = draw(walk, 0, range(0, walk.steps[0], every), width, height)
+    columns, frames = math.ceil(math.sqrt(len(films))), []
+    for i in range(max(len(film) for film in films.values())):
+        sheet = Image.new("RGB", (columns * width, math.ceil(len(films) / columns) * height), "white")
+        for place, (name, film) in enumerate(films.items()):
+            x, y = place % columns * width, place // columns * height
+            sheet.paste(Image.fromarray(film[min(i, len(film) - 1)]), (x, y))
+            ImageDraw.Draw(sheet).text((x + 6, y + 4), name, fill="black", font_size=14)
+        frames.append(np.asarray(sheet))
+    write_gif(frames, path, every * CONTROL_DT)
 
 
 def write_gif(frames: list[np.ndarray], path: Path, seconds_a_frame: float) -> None:

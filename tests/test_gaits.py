@@ -4,12 +4,14 @@ import csv
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 import checkpoint
 import evaluate
+import render
 from baselines import make_policy
 from faults import disable, healthy, lock
 from gaits import duty_factor, feet_down, measure, stride_frequency, without_chatter
@@ -79,14 +81,33 @@ def test_gaits_of_every_fault(robot, task, cases, methods, tmp_path, monkeypatch
     assert (tmp_path / f"gaits-{robot}.png").stat().st_size > 1000
 
 
-def test_where_nothing_can_be_rendered_the_numbers_come_all_the_same(tmp_path):
+@pytest.mark.parametrize("way, says", [("disable", "MUJOCO_GL is disable"), ("nonsense", "MUJOCO_GL is nonsense")])
+def test_where_nothing_can_be_rendered_the_numbers_come_all_the_same(way, says, tmp_path):
     card = {"robot": "a1", "task": "stiffness", "policy": "rolt", "steps": 0, "seed": 0}
     checkpoint.save(card | {"weights": make_policy("rolt", ROBOTS["a1"]).state_dict()}, tmp_path / "policy.pt")
     command = ["evaluate.py", "gaits", "--checkpoints", tmp_path / "policy.pt", "--episodes", "1", "--seconds", "0.1"]
     done = subprocess.run(
-        [sys.executable, str(ROOT / command[0]), *map(str, command[1:]), "--out", str(tmp_path)],
-        env={"MUJOCO_GL": "disable", "PATH": "/usr/bin:/bin"}, capture_output=True, text=True,
+        [sys.executable, str(ROOT / command[0]), *map(str, command[1:]), "--out", str(tmp_path), "--video", "film.gif"],
+        env={"MUJOCO_GL": way, "PATH": "/usr/bin:/bin"}, capture_output=True, text=True, cwd=tmp_path,
     )  # fmt: skip
-    assert done.returncode == 0, done.stderr
-    assert done.stdout.count("MUJOCO_GL is disable") == 1
-    assert (tmp_path / "gaits-a1.csv").exists() and (tmp_path / "gaits-a1.png").exists()
+    assert done.stdout.count(says) == 1 and (tmp_path / "gaits-a1.csv").exists() and (tmp_path / "gaits-a1.png").exists()
+    assert done.returncode == 2 and says in done.stderr and done.stderr.count("\n") == 1  # the film that was asked for
+
+
+def test_a_film_shows_every_case_and_who_falls_stays_as_it_fell(tmp_path, monkeypatch):
+    """Stand-ins: the first robot falls after 6 of 20 steps, and a frame is as bright as its step."""
+    sheets = []
+    monkeypatch.setattr("render.record", lambda *args: SimpleNamespace(steps=[6 if args[2] == [lock("FL_calf")] else 20]))
+    monkeypatch.setattr("render.draw", lambda walk, i, steps, w, h: [np.full((h, w, 3), step, np.uint8) for step in steps])
+    monkeypatch.setattr("render.write_gif", lambda frames, path, seconds: sheets.extend(frames))
+    render.film_cases(None, "a1", {"FL": (lock("FL_calf"), 0.7, {}), "healthy": (healthy(), 0.7, {})}, 0.4, tmp_path)
+    assert [sheet.shape for sheet in sheets] == [(160, 480, 3)] * 5  # every fourth step; two cases side by side
+    assert [sheet[100, 100, 0] for sheet in sheets] == [0, 4, 4, 4, 4]
+    assert [sheet[100, 340, 0] for sheet in sheets] == [0, 4, 8, 12, 16]
+
+
+def test_a_video_is_a_gif_of_robots_that_walk(capsys):
+    for words in (["stiffness", "--video", "film.mp4"], ["dropout_ratio", "--video", "film.gif"]):
+        with pytest.raises(SystemExit):
+            evaluate.main(words)
+        assert "--video is a .gif file" in capsys.readouterr().err
