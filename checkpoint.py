@@ -6,6 +6,8 @@ Two kinds, both of torch.save, both dictionaries of plain values and tensors:
     checkpoint.pt  the same and everything else that training needs to go on: `train.py --resume`.
 
     >>> policy, card = load_policy("checkpoints/a1-stiffness-rolt.pt")
+
+    python checkpoint.py runs/a1-stiffness-roam-seed0/policy.pt checkpoints/a1-stiffness-roam.pt    # a copy half as large
 """
 
 import os
@@ -16,6 +18,7 @@ from pathlib import Path
 import torch
 
 from baselines import METHODS, make_policy
+from cli import Parser, fail
 from faults import TASKS
 from normalizer import Normalizer
 from robots import ROBOTS
@@ -138,11 +141,23 @@ def load_policy(path: str | Path, robot: str | None = None) -> tuple[torch.nn.Mo
         raise CheckpointError(f"{path} is of a robot, task or policy unknown here: {what}")
     if robot is not None and card["robot"] != robot:
         raise CheckpointError(f"{path} was trained on the {card['robot']}, not on the {robot}")
-    policy = make_policy(card["policy"], ROBOTS[card["robot"]], TASKS[card["task"]])
-    if why := misfit(content["weights"], policy.state_dict(), "weights"):
+    policy, weights = make_policy(card["policy"], ROBOTS[card["robot"]], TASKS[card["task"]]), content["weights"]
+    if isinstance(weights, dict):
+        weights = {name: x.float() if getattr(x, "dtype", None) == torch.half else x for name, x in weights.items()}
+    if why := misfit(weights, policy.state_dict(), "weights"):
         raise CheckpointError(f"the weights in {path} do not fit the policy {card['policy']} ({why}): train it again")
-    policy.load_state_dict(content["weights"])
+    policy.load_state_dict(weights)
     return policy.eval(), card
+
+
+def halve(path: Path, copy: Path) -> None:
+    """Copies a policy with its matrices in half precision, for files that are large to ship: ROAM's has four networks.
+
+    CheckpointError if the file holds no policy; OSError if the copy cannot be written.
+    """
+    (policy, card), init = load_policy(path), load(path).get("init")
+    weights = {name: x.half() if x.dim() > 1 else x for name, x in policy.state_dict().items()}
+    save(card | {"init": init, "weights": weights}, copy)
 
 
 def start_from(path: str | Path, policy: torch.nn.Module, critic: torch.nn.Module) -> None:
@@ -165,3 +180,15 @@ def start_from(path: str | Path, policy: torch.nn.Module, critic: torch.nn.Modul
     for module in policy.modules():
         if isinstance(module, Normalizer):
             module.count.zero_()
+
+
+if __name__ == "__main__":
+    parser = Parser(__doc__)
+    parser.add_argument("file", type=Path, help="a policy.pt")
+    parser.add_argument("copy", type=Path)
+    args = parser.parse_args()
+    try:
+        halve(args.file, args.copy)
+    except (CheckpointError, OSError) as error:
+        fail(error)
+    print(f"written: {args.copy} ({args.copy.stat().st_size / 1e6:.1f} MB, {args.file} has {args.file.stat().st_size / 1e6:.1f})")

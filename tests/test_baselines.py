@@ -58,6 +58,13 @@ def test_every_policy_acts_and_survives_saving(name, tmp_path):
     copy, _ = checkpoint.load_policy(tmp_path / "policy.pt", "a1")
     with torch.no_grad():
         assert torch.equal(copy(observation), action)
+    checkpoint.halve(tmp_path / "policy.pt", tmp_path / "half.pt")
+    half, _ = checkpoint.load_policy(tmp_path / "half.pt", "a1")
+    if name != "roam":  # whose choice among behaviours is a draw
+        with torch.no_grad():
+            assert torch.allclose(half(observation), action, atol=2e-3)
+    sizes = [(tmp_path / file).stat().st_size for file in ("policy.pt", "half.pt")]
+    assert sizes[1] < 0.6 * sizes[0] and sizes[1] < 5e6
 
 
 @pytest.mark.parametrize("name", METHODS)
