@@ -196,6 +196,7 @@ def train(rank: int, args, sync: str | None, stop: list) -> None:
     if args.device == "cuda":
         device = torch.device("cuda", int(os.environ.get("LOCAL_RANK", 0)))
         torch.cuda.set_device(device)
+        torch.set_float32_matmul_precision("high")  # TF32, in rollout and update alike: products are rounded the same way
     if args.processes > 1:
         backend = "nccl" if args.device == "cuda" else "gloo"
         dist.init_process_group(backend, init_method=sync, rank=rank, world_size=args.processes)
