@@ -173,7 +173,8 @@ def start_from(path: str | Path, policy: torch.nn.Module, critic: torch.nn.Modul
         missing, _ = policy.load_state_dict(content["weights"], strict=False)
         if missing:
             raise KeyError(missing[0])
-        if content.get("critic"):  # a finished RMA or ROAM has none
+        own = any(module is critic for module in policy.modules())  # ROAM's values are among its weights
+        if content.get("critic") and not own:  # a finished RMA has none
             critic.load_state_dict(content["critic"])
     except (RuntimeError, TypeError, AttributeError, KeyError) as error:
         raise CheckpointError(f"the weights in {path} do not fit this policy: start from one of its own") from error

@@ -238,7 +238,7 @@ class LocomotionEnv:
         info["final_observation"] = self.observe(np.flatnonzero(truncated))
         info["episode_returns"], info["episode_lengths"] = self.episode_return[ended].copy(), self.age[ended].copy()
         if len(ended):
-            self._climb(ended)
+            self._climb(ended[~diverged[ended]])  # whose position is none
             self._reset(ended)
         return self.observe(), reward.astype(np.float32), terminated, truncated, info
 

@@ -2,7 +2,7 @@
 
 A `Fault` is a few numbers. `write_fault` puts them on chosen robots of a batch, starting from the healthy model each
 time; so the next fault that is written (at every reset) undoes the last one. What the numbers act on is prepared in
-robots.py. Sections IV-A and IV-D of the paper:
+robots.py. Sections IV-A and IV-C of the paper:
 
     limping   "we simply lock the calf joint"             lock("FR_calf")       stiffness test, A1
     damage    "we simply set the torque output to zero"   disable("FR_thigh")   damage test, hexapod
@@ -170,13 +170,9 @@ def write_fault(fault: Fault, robot: Robot, world: Batch, ids: np.ndarray) -> No
     A motor is force = gain . ctrl + bias . (1, q, dq), clipped to its range: scaling all three scales the torque.
     Friction is the env's to draw anew before each call, but for the box's.
     """
-    model, share = world.model, motor_strength(fault, robot)[:, None]  # (L*J, 1)
-    world.bind("eq_active")[ids] = joint_mask(fault.locked, robot)
-    world.expand("actuator_gainprm")[ids] = model.actuator_gainprm * share
-    world.expand("actuator_biasprm")[ids] = model.actuator_biasprm * share
-    world.expand("actuator_forcerange")[ids] = model.actuator_forcerange * share
-    world.expand("jnt_range")[ids] = joint_limits(fault, robot, model)
-    loss, reach = model.dof_frictionloss.copy(), model.tendon_range.copy()
+    model = world.model
+    locked, share = joint_mask(fault.locked, robot), motor_strength(fault, robot)[:, None]  # (L*J,), (L*J, 1)
+    limits, loss, reach = joint_limits(fault, robot, model), model.dof_frictionloss.copy(), model.tendon_range.copy()
     try:
         for leg in fault.skating:
             loss[model.joint(f"{leg}_wheel").dofadr] = 0.0
@@ -184,6 +180,12 @@ def write_fault(fault: Fault, robot: Robot, world: Batch, ids: np.ndarray) -> No
             reach[model.tendon(f"{leg}_tether").id, 1] = TETHER
     except KeyError:
         raise ValueError(f"there is no box or wheel for {fault}: make the env with this fault among its faults") from None
+    # nothing is written until all of it is known to be possible
+    world.bind("eq_active")[ids] = locked
+    world.expand("actuator_gainprm")[ids] = model.actuator_gainprm * share
+    world.expand("actuator_biasprm")[ids] = model.actuator_biasprm * share
+    world.expand("actuator_forcerange")[ids] = model.actuator_forcerange * share
+    world.expand("jnt_range")[ids] = limits
     world.expand("dof_frictionloss")[ids] = loss
     if model.ntendon:
         world.expand("tendon_range")[ids] = reach
@@ -227,7 +229,7 @@ TASKS = {
 }
 
 
-# Section IV-D: "we weaken the motor strength of one leg and lock the hind back leg with a string", "pull a box with one
+# Section IV-C: "we weaken the motor strength of one leg and lock the hind back leg with a string", "pull a box with one
 # single hind right leg", "two roller skates are tied to the robot's front feet". The paper gives no numbers. Ours: half the
 # strength; of the front leg that training never harmed, and of the hind leg that tows, so that both are new; the string at
 # the default angle, where training locks.

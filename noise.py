@@ -1,4 +1,4 @@
-"""Noise on the scandots, for tests: policies are trained on clean ones (section IV-B of the paper).
+"""Noise on the scandots, for tests (section IV-B of the paper). What MLP and RMA are trained with is in baselines.py.
 
     low frequency   k of the 12 patches are each "offset as a whole by a distance in random directions"
     high frequency  every point is "shifted vertically and laterally with Gaussian noise independently"
@@ -93,7 +93,8 @@ class NoisyScan:
     """The scandots of N robots as they see them. Its random generator is its own: noise changes nothing but the scan."""
 
     def __init__(self, num_envs: int, terrain: Terrain | None, noise: ScanNoise, seed: int | tuple[int, ...]):
-        self.terrain, self.noise, self.rng = terrain, noise, np.random.default_rng(seed)
+        self.terrain, self.noise = terrain, noise
+        self.rng = np.random.default_rng((*np.atleast_1d(seed), 1))  # not the numbers that the env draws from its own seed
         self.shift = np.zeros((num_envs, *SCAN_SHAPE, 3))  # m, of the patches
         self.missing = np.zeros((num_envs, *SCAN_SHAPE), dtype=bool)
 

@@ -165,7 +165,7 @@ def collect(
         buffer.next_value[t] = 0
         if len(info["truncated_ids"]):  # the next observation in the buffer is of another episode: ask the true one
             ids = torch.from_numpy(info["truncated_ids"]).to(device)
-            buffer.next_value[t, ids] = critic(to_tensors(info["final_observation"], device))
+            buffer.next_value[t, ids] = critic(to_tensors(info["final_observation"], device))  # clean heights: the noise's mean
         infos.append(info)
     last_value = critic(to_tensors(observation, device))
     following = torch.cat([buffer.value[1:], last_value[None]])

@@ -1,7 +1,8 @@
 """Runs the training loop in one process or in one a core, and ends it well.
 
 Ctrl-C and SIGTERM let the loop save and end. What a user can mend (a full disk, a checkpoint that does not fit) is said in
-one line. If a process dies, so do the others: they would wait for it for ever. Exit codes: 2 for wrong input, 1 for the rest.
+one line. If a process dies, so do the others: they would wait for it for ever. Exit codes: 2 for wrong input, 1 for the rest
+(3, within a run, for a process that has lost another).
 """
 
 import multiprocessing as mp

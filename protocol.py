@@ -130,13 +130,12 @@ def print_table(
 
 
 def print_falls(args, rows: list[dict], cases: list[str], labels: list[str]) -> None:
-    """How many episodes of each method and case ended in a fall."""
-    total = len([row for row in rows if (row["method"], row["case"]) == (rows[0]["method"], cases[0])])
-    print(f"\nepisodes with a fall, of {total}")
+    """How many episodes of each method and case ended in a fall (before their very last step)."""
+    print("\nepisodes with a fall")
     for method in methods_of(rows):
-        mine = [row for row in rows if row["method"] == method]
-        falls = [sum(float(r["fall_time_s"]) < args.seconds for r in mine if r["case"] == case) for case in cases]
-        print(f"{method:28}" + "".join(f"{n:>{column_width(labels)}}" for n in falls))
+        mine = [[float(r["fall_time_s"]) for r in rows if (r["method"], r["case"]) == (method, case)] for case in cases]
+        words = [f"{sum(time < args.seconds for time in times)} of {len(times)}" for times in mine]
+        print(f"{method:28}" + "".join(f"{word:>{column_width(labels)}}" for word in words))
 
 
 def column_width(labels: list[str]) -> int:

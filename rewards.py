@@ -37,7 +37,8 @@ def roll_pitch_velocity(env) -> np.ndarray:
 
 
 def collision(env) -> np.ndarray:
-    """The number of thighs and calves that touch the ground (legged_gym's sum of the table's indicator)."""
+    """The number of links with a capsule (thighs, calves, a hexapod's hips) that touch the ground: legged_gym's sum of the
+    table's indicator."""
     return np.sum(env.link_contact, axis=1)
 
 

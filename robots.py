@@ -14,7 +14,7 @@ What a fault (faults.py) will change on one robot is prepared here, so that a fa
 
 Legend: L legs, J joints a leg. Legs are ordered FR, FL, RR, RL (front/rear, right/left), joints hip, thigh, calf.
 
-    python robots.py            # prints every robot: masses, limits, standing height
+    python robots.py            # prints every robot: masses, limits, gains
 """
 
 from dataclasses import dataclass

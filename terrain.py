@@ -8,7 +8,7 @@ square with a flat strip around it; robots start on the strip in front of it and
     stairs      a pyramid of 6 steps
     platforms   5 x 5 blocks of random height
 
-Heights grow with the level (legged_gym's formulas, of which level 0 is the easiest and 10 the hardest; -1 and -2 are ours,
+Heights grow with the level (legged_gym's formulas, whose curriculum goes from level 0 to 9; -1, -2 and 10 are ours, -1 and -2
 for a policy that comes from flat ground and hardly lifts its feet). Unlike legged_gym's, the ground is not
 a height field but boxes and convex meshes: a height field costs four times as much to collide with, and its steps are
 never quite vertical. All coordinates in metres. Walking robots climb the levels as in legged_gym (`next_row`).
@@ -28,7 +28,7 @@ TILE = 8.0  # m, side of a tile, legged_gym
 BORDER = 0.5  # m, ours: a flat strip on every side, so that tiles meet at height 0 and a robot starts on level ground
 HALF = TILE / 2 - BORDER  # m, half the width of what stands on a tile
 TREAD = 0.31  # m, depth of a step, legged_gym
-STEPS = 6  # leaves a platform 3.28 m wide on top (legged_gym: at least 3 m)
+STEPS = 6  # leaves a platform 3.9 m wide on top (legged_gym: at least 3 m)
 SLOPE_RUN = 2.0  # m, from the edge of a slope to its platform, which is then 3 m wide (legged_gym)
 BLOCKS = 5  # a side
 BLOCK = 2 * HALF / BLOCKS  # m; legged_gym's are 1 to 2 m

@@ -1,6 +1,6 @@
 """Trains a policy: PPO on every core, or on a GPU.
 
-    python train.py --robot a1                            # ROLT on the stiffness task, a few hours on two cores
+    python train.py --robot a1                            # ROLT on the stiffness task, 95 minutes on two cores
     python train.py --robot a1 --steps 20000              # does it run? a minute
     python train.py --robot a1 --resume                   # goes on where it was stopped (Ctrl-C is safe)
     python train.py --robot a1 --task terrain --init runs/a1-stiffness-rolt-seed0/checkpoint.pt    # stairs, after flat ground
@@ -72,8 +72,9 @@ def parse_arguments(argv: list[str] | None = None):
     parser.add_argument("--save-minutes", type=positive, default=3.0, help="time between two checkpoints")
     args = parser.parse_args(argv)
 
-    if args.paper:
-        args.envs, args.steps, args.epochs, args.minibatches = 4096, 400_000_000, 5, 4
+    if args.paper:  # what is said beside it still counts
+        parser.set_defaults(envs=4096, steps=400_000_000, epochs=5, minibatches=4)
+        args = parser.parse_args(argv)
     args.task = args.task or next(name for name, task in TASKS.items() if args.robot in task.robots)
     if args.robot not in TASKS[args.task].robots:
         fail(f"the task {args.task} is for {', '.join(TASKS[args.task].robots)}, not for {args.robot}")
@@ -259,6 +260,8 @@ def train(rank: int, args, sync: str | None, stop: list) -> None:
             checkpoint.save({key: content[key] for key in (*checkpoint.CARD, "init", "weights")}, args.out / "policy.pt")
             checkpoint.save_next(content, args.out / "checkpoint.pt")
             learning_curve(progress.path, args.out / "progress.png")
+        if args.processes > 1:
+            dist.barrier()  # what any process reads next is the new file
 
     progress = Progress(args, iteration, steps)
     saved_at = time.monotonic()

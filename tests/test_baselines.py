@@ -67,6 +67,15 @@ def test_every_policy_acts_and_survives_saving(name, tmp_path):
     assert sizes[1] < 0.6 * sizes[0] and sizes[1] < 5e6
 
 
+def test_a_start_from_roams_second_behaviour_leaves_the_first_its_values(tmp_path):
+    """A file of that stage names critics[1] as its critic; a fresh run begins with critics[0]."""
+    saved, policy = fresh("roam"), make_policy("roam", A1, TASK)
+    critic = training_stages(policy, TASK)[0].critic
+    checkpoint.save({"weights": saved.state_dict(), "critic": saved.critics[1].state_dict()}, tmp_path / "checkpoint.pt")
+    checkpoint.start_from(tmp_path / "checkpoint.pt", policy, critic)
+    assert torch.equal(policy.critics[0].network[0].weight, saved.critics[0].network[0].weight)
+
+
 @pytest.mark.parametrize("name", METHODS)
 def test_each_stage_trains_its_weights_and_no_others(name):
     policy, trained = fresh(name), set()

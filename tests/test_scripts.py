@@ -286,6 +286,11 @@ def test_two_trainings_never_share_a_folder(tmp_path, capsys):
     train.main(["--threads", "1", *SMALL, "--steps", "192", "--out", str(tmp_path)])
 
 
+def test_the_papers_size_and_what_is_said_beside_it(tmp_path):
+    args = train.parse_arguments(["--paper", "--envs", "1024", "--device", "cpu", "--out", str(tmp_path)])
+    assert (args.envs, args.steps, args.epochs, args.minibatches) == (1024, 400_000_000, 5, 4)
+
+
 def test_a_torn_row_does_not_stop_the_learning_curve(tmp_path):
     header = "steps,speed,commanded_speed,episode_return,episode_seconds,sigma,kl"
     (tmp_path / "progress.csv").write_text(f"{header}\n1,0,0,1,1,1,0\n2,0,0\n3,0,0,1,1,1,0,9\n4,0,0,1,1,1,0\n")

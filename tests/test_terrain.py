@@ -155,6 +155,9 @@ def test_robots_climb_when_their_episode_ends():
     env.step(np.zeros((2, 12)))
     assert list(env.row) == [1, 0]
     assert env.position[0, 0] == pytest.approx(8.0) and env.position[1, 1] == pytest.approx(8.0, abs=1.0)
+    env.world.bind("qvel")[0] = np.nan  # a diverged simulation is put at (0, 0), far from where its robot began
+    env.step(np.zeros((2, 12)))
+    assert list(env.row) == [1, 0] and env.divergences == 1
 
 
 def test_a_robot_stands_on_every_tile():

@@ -66,13 +66,14 @@ def test_noise_changes_while_it_walks(show):
     "wish, says",
     [
         ("melt:FR", "lock:FR_calf"), ("lock:MR_calf", "no joint"), ("tow:MR", "no leg MR"), ("-1", "-1"),
-        ("sigma:-1", "write clean, offset"),
+        ("sigma:-1", "write clean, offset"), ("half-lock:RR_calf:5", "no stop at 5"),
     ],  # fmt: skip
 )
 def test_a_wish_that_cannot_be_read_changes_nothing(show, wish, says):
     show.obey("lock:RL_calf")
     show.obey(wish)
     assert says in show.said and show.fault == lock("RL_calf") and show.speed == 0.75
+    assert show.env.world.bind("eq_active")[0].tolist() == [0] * 11 + [1]
     show.step()
 
 
