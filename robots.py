@@ -49,9 +49,8 @@ class Link:
     com: Vec3  # m, centre of mass in the link's frame
     inertia: Inertia  # kg m^2 about the centre of mass, link axes
     offset: Vec3  # m, joint origin in the parent link's frame (the first link's are `Robot.mounts`)
-    axis: Vec3  # joint axis, right legs
-    axis_left: Vec3  # joint axis, left legs
-    limits: tuple[float, float]  # rad
+    axis: Vec3  # joint axis, of left legs too: the mirror image of a turn about x or z is then a turn the other way
+    limits: tuple[float, float]  # rad, right legs
     effort: float  # N m, torque limit
     capsule: tuple[float, Vec3, Vec3] | None  # collision shape: radius, start, end (m, link frame)
     rear_mirrors_x: bool = False  # rear legs mirror this link in x as well
@@ -132,8 +131,9 @@ def build_model(
             name = f"{leg}_{link.name}"
             body = parent.add_body(name=name, pos=mount if i == 0 else mirror * link.offset)
             _set_inertia(body, link.mass, mirror * link.com, _mirror_inertia(link.inertia, mirror))
+            low, high = link.limits
             body.add_joint(
-                name=name, axis=link.axis_left if left else link.axis, range=link.limits, ref=0.0,
+                name=name, axis=link.axis, range=(-high, -low) if left and not link.axis[1] else (low, high), ref=0.0,
                 armature=robot.armature, frictionloss=robot.friction_loss,
             )  # fmt: skip
             if link.capsule is not None:
@@ -259,15 +259,15 @@ A1 = Robot(
     links=(
         Link("hip", 0.696, (-0.003311, -0.000635, 3.1e-5),
              (0.000469246, 0.00080749, 0.000552929, 9.4e-6, -3.4e-7, 4.7e-7),
-             offset=(0, 0, 0), axis=(1, 0, 0), axis_left=(1, 0, 0), limits=(-0.802851, 0.802851), effort=33.5,
+             offset=(0, 0, 0), axis=(1, 0, 0), limits=(-0.802851, 0.802851), effort=33.5,
              capsule=None, rear_mirrors_x=True),
         Link("thigh", 1.013, (-0.003237, 0.022327, -0.027326),
              (0.00552906, 0.00513934, 0.00136779, -4.8e-6, 3.44e-4, -2.24e-5),
-             offset=(0, _A1_THIGH_Y, 0), axis=(0, 1, 0), axis_left=(0, 1, 0), limits=(-1.0472, 4.18879), effort=33.5,
+             offset=(0, _A1_THIGH_Y, 0), axis=(0, 1, 0), limits=(-1.0472, 4.18879), effort=33.5,
              capsule=(0.015, (0, 0, -0.01), (0, 0, -0.185))),
         Link("calf", 0.226, (0.00472659, 0, -0.131975),
              (0.00338556, 0.00340344, 4.385e-5, 0, -1.67e-4, 0),
-             offset=(0, 0, -0.2), axis=(0, 1, 0), axis_left=(0, 1, 0), limits=(-2.69653, -0.916298), effort=33.5,
+             offset=(0, 0, -0.2), axis=(0, 1, 0), limits=(-2.69653, -0.916298), effort=33.5,
              capsule=(0.01, (0, 0, 0), (0, 0, -0.18))),
     ),
     foot_position=(0, 0, -0.2),
@@ -294,15 +294,15 @@ GO1 = Robot(
     links=(
         Link("hip", 0.68, (-0.0049166, 0.00762615, -8.865e-5),
              (0.00039938, 0.00073342, 0.00046842, 1.5e-5, 1e-6, -2e-6),
-             offset=(0, 0, 0), axis=(1, 0, 0), axis_left=(1, 0, 0), limits=(-0.863, 0.863), effort=23.7,
+             offset=(0, 0, 0), axis=(1, 0, 0), limits=(-0.863, 0.863), effort=23.7,
              capsule=None, rear_mirrors_x=True),
         Link("thigh", 1.009, (-0.00304722, 0.019315, -0.0305004),
              (0.0045988, 0.0046892, 0.00081745, -6.1e-5, -2.28e-4, -6.11e-4),
-             offset=(0, -0.08, 0), axis=(0, 1, 0), axis_left=(0, 1, 0), limits=(-0.686, 4.501), effort=23.7,
+             offset=(0, -0.08, 0), axis=(0, 1, 0), limits=(-0.686, 4.501), effort=23.7,
              capsule=(0.015, (0, 0, -0.01), (0, 0, -0.198))),
         Link("calf", 0.195862, (0.00429862, 0.000976676, -0.146197),
              (0.00148449, 0.00149764, 3.607e-5, 0, -1.8e-5, -4e-6),
-             offset=(0, 0, -0.213), axis=(0, 1, 0), axis_left=(0, 1, 0), limits=(-2.818, -0.888), effort=35.55,
+             offset=(0, 0, -0.213), axis=(0, 1, 0), limits=(-2.818, -0.888), effort=35.55,
              capsule=(0.01, (0, 0, 0), (0, 0, -0.19))),
     ),
     foot_position=(0, 0, -0.213),
@@ -319,7 +319,9 @@ GO1 = Robot(
 # ElSpider Air, 30.5 kg: the hexapod of the authors' laboratory (the paper names none). Source: extended_legged_gym
 # el_mini.urdf (masses, inertias, geometry, limits) and elspider_air.h (pose, gains). The hips turn about the vertical,
 # the thighs point up and the calves down. The foot (0.019 kg) is part of the calf. Links are capsules as thick as
-# their boxes. Ours, where the sources are silent: armature and dry friction (the A1's), the start height.
+# their boxes. Ours, where the sources are silent: armature and dry friction (the A1's), the start height. And the signs on
+# the left, where the URDF mirrors the axes, too: with its signs all six legs stand at the same angles, and ROLT, which has
+# no other way to tell left from right at first, learned to walk within a million steps but not to hold a course in 1.7.
 HEXAPOD = Robot(
     name="hexapod",
     trunk_mass=15.8991,
@@ -332,20 +334,20 @@ HEXAPOD = Robot(
     links=(
         Link("hip", 1.20924, (-0.01147, -0.12306, -0.03644),
              (0.00506, 0.00134, 0.00448, -3.8e-4, -1.2e-4, -1.02e-3),
-             offset=(0, 0, 0), axis=(0, 0, 1), axis_left=(0, 0, -1), limits=(-0.785, 0.785), effort=33.5,
+             offset=(0, 0, 0), axis=(0, 0, 1), limits=(-0.785, 0.785), effort=33.5,
              capsule=(0.04, (0.02, -0.06, -0.03), (0.0355, -0.14, -0.04)), rear_mirrors_x=True),
         Link("thigh", 0.925235, (-0.01977, 0.00006, 0.11425),
              (0.00238, 0.00209, 0.00066, 0, 1.2e-4, 0),
-             offset=(0.0355, -0.14999, -0.04506), axis=(1, 0, 0), axis_left=(-1, 0, 0), limits=(-0.5233, 3.14), effort=33.5,
+             offset=(0.0355, -0.14999, -0.04506), axis=(1, 0, 0), limits=(-0.5233, 3.14), effort=33.5,
              capsule=(0.04, (0, 0, 0), (0, 0, 0.13)), rear_mirrors_x=True),
         Link("calf", 0.3004999, (0.009795, 0, -0.080474),
              (0.003056, 0.0030374, 9.137e-5, 0, 1.952e-4, 0),
-             offset=(0, 0, 0.13), axis=(-1, 0, 0), axis_left=(1, 0, 0), limits=(-0.6978, 3.925), effort=33.5,
+             offset=(0, 0, 0.13), axis=(-1, 0, 0), limits=(-0.6978, 3.925), effort=33.5,
              capsule=(0.015, (0, 0, 0), (0.0166, 0, -0.213)), rear_mirrors_x=True),
     ),
     foot_position=(0.018, 0, -0.232),
     foot_radius=0.02,
-    default_pose=((0, 0.6, 0.6),) * 6,
+    default_pose=((0, 0.6, 0.6), (0, -0.6, -0.6)) * 3,
     start_height=0.22,
     stiffness=80.0,
     damping=2.0,
