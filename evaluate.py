@@ -224,7 +224,7 @@ EXPERIMENTS = {
 }
 DEFAULTS = {  # where they are not the task's first robot, the paper's 20 s and all methods
     "real_world": {"robot": "go1", "seconds": 10.0},
-    "gaits": {"seconds": 10.0, "methods": ("rolt", "rma")},
+    "gaits": {"seconds": 10.0, "methods": ("rolt", "mlp")},
 }
 
 
