@@ -233,7 +233,7 @@ class ROAM(Policy):
         self.behaviours = nn.ModuleList(MLP(num_legs, num_joints) for _ in range(num_situations))
         self.critics = nn.ModuleList(BehaviourValue(inputs, behaviour.normalizer) for behaviour in self.behaviours)
         self.generator = torch.Generator().manual_seed(0)  # of the choice at test
-        self.picked = torch.zeros(num_situations)  # how often each behaviour was chosen at test
+        self.picked = torch.zeros(0, num_situations)  # (B, K) how often each robot chose each behaviour at test
 
     def sigma(self) -> Tensor:
         return torch.stack([behaviour.sigma() for behaviour in self.behaviours]).mean(0)
@@ -248,7 +248,9 @@ class ROAM(Policy):
         else:
             odds = self.values(observation).softmax(dim=1).cpu()
             choice = torch.multinomial(odds, 1, generator=self.generator).to(observation.legs.device)
-            self.picked += torch.bincount(choice.flatten().cpu(), minlength=len(self.picked))
+            if len(self.picked) != len(choice):
+                self.picked = torch.zeros(odds.shape)
+            self.picked += nn.functional.one_hot(choice.squeeze(1).cpu(), odds.shape[1])
         actions = torch.stack([behaviour(observation) for behaviour in self.behaviours], dim=1)  # (B, K, A)
         return actions.gather(1, choice[:, :, None].expand(-1, -1, actions.shape[2])).squeeze(1)
 

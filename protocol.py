@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from env import CONTROL_DT, EnvConfig, LocomotionEnv
-from faults import Fault
+from faults import TASKS, Fault
 from plots import bar_charts, curves
 from ppo import to_tensors
 
@@ -72,7 +72,12 @@ def run_cases(args, cases: dict[str, Fault], speed: float, **env_options) -> lis
     labels = [(case, episode) for case in cases for episode in range(args.episodes)]
     rows = []
     for path, (policy, card) in args.policies.items():
+        chooses = card["policy"] == "roam"
+        if chooses:
+            policy.picked.zero_()
         outcome = run_episodes(policy, args.robot, faults, speed, args.seconds, args.seed, args.threads, **env_options)
+        if chooses:
+            print_choices(policy.picked, [str(fault) for _, fault in TASKS[card["task"]].training], list(cases))
         for i, (case, episode) in enumerate(labels):
             measured = {name: f"{values[i]:.4f}" for name, values in outcome.items()}
             row = {"method": card["policy"], "checkpoint": str(path), "seed": card["seed"], "case": case}
@@ -136,6 +141,15 @@ def print_falls(args, rows: list[dict], cases: list[str], labels: list[str]) -> 
         mine = [[float(r["fall_time_s"]) for r in rows if (r["method"], r["case"]) == (method, case)] for case in cases]
         words = [f"{sum(time < args.seconds for time in times)} of {len(times)}" for times in mine]
         print(f"{method:28}" + "".join(f"{word:>{column_width(labels)}}" for word in words))
+
+
+def print_choices(picked: torch.Tensor, behaviours: list[str], cases: list[str]) -> None:
+    """Of ROAM: the share of each behaviour (K of them) in all steps of a case. picked: (cases * episodes, K) steps."""
+    shares = picked.unflatten(0, (len(cases), -1)).sum(1)  # (cases, K)
+    shares /= shares.sum(1, keepdim=True)
+    print(f"\n{'roam chooses':28}" + "".join(f"{case:>{column_width(cases)}}" for case in cases))
+    for name, row in zip(behaviours, shares.T.tolist(), strict=True):
+        print(f"{name:28}" + "".join(f"{share:>{column_width(cases)}.0%}" for share in row))
 
 
 def column_width(labels: list[str]) -> int:

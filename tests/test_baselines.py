@@ -185,4 +185,4 @@ def test_roam_acts_in_training_by_its_situation_and_at_test_by_its_values():
         assert torch.equal(policy(told), each[index])
     torch.nn.init.constant_(policy.critics[1].network[-1].bias, 50.0)  # e^-50: the second one, surely
     assert torch.equal(policy(observation), each[1])
-    assert policy.picked.tolist() == [0.0, 6.0]
+    assert policy.picked.tolist() == [[0.0, 1.0]] * 6
