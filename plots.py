@@ -63,7 +63,8 @@ def bar_charts(
         axis.set_ylim(bottom=min(0, axis.get_ylim()[0]))
         axis.grid(axis="y", alpha=0.3)
     if len(methods) > 1:
-        axes[0, -1].legend(fontsize=8, frameon=False, loc="lower right")
+        handles, labels = axes[0, 0].get_legend_handles_labels()
+        figure.legend(handles, labels, fontsize=8, frameon=False, loc="outside lower center", ncols=len(methods))
     else:
         title = f"{title}, {', '.join(methods)}"
     figure.suptitle(title, fontsize=10)
