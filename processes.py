@@ -41,14 +41,19 @@ def guarded(train, rank: int, args, sync: str | None = None, told=None) -> None:
     former = {number: signal.signal(number, lambda *_: stop.append(True)) for number in SIGNALS}
     try:
         return train(rank, args, sync, stop)
+    except SystemExit:
+        if told is not None:
+            told.acquire(block=False)  # it has said why
+        raise
     except CheckpointError as error:
         code, says = 2, error
     except (OSError, FloatingPointError) as error:
         code, says = 1, f"{error}{last_saved(args)}"
     except (MemoryError, RuntimeError) as error:
-        if "gloo" in str(error) and told is not None:  # another process has ended, and the one that started us says so
+        lost = "gloo" in str(error) or "NCCL" in str(error)
+        if lost and told is not None:  # another process has ended, and the one that started us says so
             os._exit(LOST)
-        if "gloo" in str(error):
+        if lost:
             code, says = LOST, f"another process of this run has ended{last_saved(args)}"
         elif isinstance(error, MemoryError) or "allocate" in str(error):  # torch's word for too little memory
             code, says = 1, f"there is not enough memory for {args.envs} robots: choose fewer with --envs"

@@ -88,6 +88,8 @@ def parse_arguments(argv: list[str] | None = None):
     if args.envs // args.processes * PPOConfig.steps < args.minibatches:
         fail(f"{args.envs} robots are too few for {args.minibatches} minibatches on {args.processes} processes")
     if args.policy == "all":
+        if "RANK" in os.environ:
+            fail("torchrun trains one policy at a time: name it instead of --policy all")
         if args.out:
             fail("every policy has a folder of its own: leave --out away with --policy all")
         return args
@@ -197,10 +199,12 @@ def train(rank: int, args, sync: str | None, stop: list) -> None:
     if args.device == "cuda":
         device = torch.device("cuda", int(os.environ.get("LOCAL_RANK", 0)))
         torch.cuda.set_device(device)
-        torch.set_float32_matmul_precision("high")  # TF32, in rollout and update alike: products are rounded the same way
+        torch.set_float32_matmul_precision("high")  # TF32, in rollout and update alike
+        torch.backends.cudnn.deterministic = True  # RMA's convolutions
     if args.processes > 1:
         backend = "nccl" if args.device == "cuda" else "gloo"
-        dist.init_process_group(backend, init_method=sync, rank=rank, world_size=args.processes)
+        gpu = device if args.device == "cuda" else None
+        dist.init_process_group(backend, init_method=sync, rank=rank, world_size=args.processes, device_id=gpu)
     torch.set_num_threads(1)
     task, robot = TASKS[args.task], ROBOTS[args.robot]
     torch.manual_seed(args.seed)  # the same weights in every process

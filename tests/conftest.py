@@ -1,7 +1,10 @@
 """Lets the tests import the scripts, wherever pytest is started from."""
 
+import os
 import sys
 from pathlib import Path
+
+os.environ["CUDA_VISIBLE_DEVICES"] = ""  # read when torch is imported: the tests are of the CPU, and so are their subprocesses
 
 import pytest
 import torch

@@ -176,6 +176,14 @@ def test_roams_loss_by_hand():
     assert torch.allclose(gradient, torch.tensor([[2 * (p - 1), 2 * (1 - p)]]))  # every value's
 
 
+def test_roams_behaviours_live_in_one_situation_each():
+    stages = training_stages(fresh("roam"), TASK)
+    assert [stage.faults for stage in stages[:2]] == [((1.0, fault),) for _, fault in TASK.training]
+    env = LocomotionEnv(A1, 2, faults=TASK.training, num_threads=1, extras=("situation",))
+    env.pin_faults([fault for _, fault in TASK.training])
+    assert env.reset().situation.tolist() == [[0.0], [1.0]]
+
+
 def test_roam_acts_in_training_by_its_situation_and_at_test_by_its_values():
     policy = fresh("roam")
     observation = observe(policy)

@@ -61,7 +61,30 @@ def test_history_rolls_oldest_first_and_starts_filled():
         assert np.allclose(after.action, target.reshape(3, 12))
         assert np.allclose(after.legs[:, :, -1, 0:3], np.array(A1.default_pose) + env.joint_error)
         assert np.allclose(after.legs[:, :, -1, 3:6], 0.05 * env.joint_velocity)
+        assert np.allclose(after.legs[:, 2, -1, 9:12], env.command * (2, 2, 0.25)) and env.command[:, 0].any()
+        assert np.allclose(after.legs[:, 2, -1, 12:15], 2 * env.linear_velocity) and env.linear_velocity.any()
+        assert np.allclose(after.legs[:, 2, -1, 15:18], 0.25 * env.angular_velocity) and env.angular_velocity.any()
+        assert np.allclose(after.legs[:, 2, -1, 18:21], env.gravity)
         before = after.legs
+
+
+def test_the_long_history_ends_with_the_short_one():
+    env = LocomotionEnv("a1", 2, num_threads=1, extras=("past",))
+    env.reset()
+    for i in range(60):
+        after, *_ = env.step(np.full((2, 12), 0.01 * i))
+    assert after.past.shape == (2, 4, 50, 21) and np.array_equal(after.legs, after.past[:, :, -10:])
+
+
+@pytest.mark.parametrize("degrees, falls", [(50, False), (70, True)])
+def test_a_trunk_tilted_by_60_degrees_has_fallen(degrees, falls):
+    env = LocomotionEnv("a1", 1, num_threads=1)
+    env.reset()
+    half = np.radians(degrees) / 2
+    env.world.bind("qpos")[0, :7] = [0, 0, 2, np.cos(half), np.sin(half), 0, 0]  # rolled, high in the air
+    env.world.bind("qvel")[0] = 0
+    _, _, terminated, _, _ = env.step(np.zeros((1, 12)))
+    assert terminated[0] == falls
 
 
 def test_body_velocities_and_gravity_are_in_the_trunks_frame():

@@ -8,7 +8,7 @@ import torch
 from baselines import make_policy
 from env import Observation
 from robots import A1
-from rolt import ROLT, ROLTConfig, drop
+from rolt import ROLT, ROLTConfig, add_dropped, drop
 
 
 def observation(n=5, legs=4, seed=0):
@@ -80,6 +80,8 @@ def test_masks_have_their_rates():
 
 def test_drop_scales_what_it_keeps():
     x = torch.full((2, 3), 9.0)
+    added = add_dropped(x, x, torch.tensor([[1.0, 0, 1], [0, 1, 1]]), 0.1)
+    assert torch.allclose(added, torch.tensor([[19.0, 9, 19], [9, 19, 19]]))
     keep = torch.tensor([[True, False, True], [False, True, True]])
     assert torch.allclose(drop(x, keep, 0.1), torch.tensor([[10.0, 0, 10], [0, 10, 10]]))
     assert drop(x, None, 0.1) is x
@@ -89,7 +91,8 @@ def test_masks_change_the_action_and_repeat_it():
     policy, obs = model(), observation()
     masks = masks_of(policy)
     assert torch.equal(policy(obs, masks), policy(obs, masks))
-    assert not torch.allclose(policy(obs, masks), policy(obs, masks_of(policy, seed=2)))
+    for name, mask in masks.items():  # each of them counts
+        assert not torch.allclose(policy(obs, masks), policy(obs, masks | {name: ~mask})), name
     everything = {name: torch.ones_like(mask) for name, mask in masks.items()}
     plain = model(feature_dropout=0.0)  # the same weights
     assert torch.allclose(plain(obs, {"patch_position": everything["patch_position"]}), policy(obs), atol=1e-5)

@@ -286,6 +286,14 @@ def test_two_trainings_never_share_a_folder(tmp_path, capsys):
     train.main(["--threads", "1", *SMALL, "--steps", "192", "--out", str(tmp_path)])
 
 
+def test_a_folder_in_use_is_said_once_by_two_processes(tmp_path):
+    lock = cli.lock_folder(tmp_path)
+    if lock is None:
+        pytest.skip("this system has no file locks")
+    done = run("train.py", "--threads", "2", *SMALL, "--steps", "384", "--out", str(tmp_path), cwd=tmp_path)
+    assert done.returncode == 2 and done.stderr.count("\n") == 1 and "another process is training" in done.stderr
+
+
 def test_the_papers_size_and_what_is_said_beside_it(tmp_path):
     args = train.parse_arguments(["--paper", "--envs", "1024", "--device", "cpu", "--out", str(tmp_path)])
     assert (args.envs, args.steps, args.epochs, args.minibatches) == (1024, 400_000_000, 5, 4)

@@ -39,7 +39,7 @@ def updated(world_size: int, rank: int = 0) -> dict:
     learner = Learner(policy, critic, PPOConfig(epochs=1, minibatches=1))
     stats = learner.update(buffer, torch.Generator().manual_seed(rank))
     return {
-        "gradient": learner.gradient, "learning_rate": learner.learning_rate, "stats": stats,
+        "gradient": learner.gradient, "learning_rate": learner.optimizer.param_groups[0]["lr"], "stats": stats,
         "weights": policy.state_dict(), "normalizer": policy.normalizer.state_dict(),
     }  # fmt: skip
 
