@@ -4,7 +4,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from env import EnvConfig, LocomotionEnv
+from env import CONTROL_DT, EnvConfig, LocomotionEnv
 from faults import TASKS, Fault, disable, healthy, lock, motor_strength, parse, weaken
 from robots import A1, ROBOTS, build_model
 
@@ -26,8 +26,39 @@ def test_model_agrees_with_the_data(robot):
         assert model.actuator(i).forcerange == pytest.approx([-link.effort, link.effort])
 
 
-def test_a1_weighs_what_unitree_says():
-    assert build_model(A1).body_mass.sum() == pytest.approx(12.453, abs=1e-6)
+@pytest.mark.parametrize(
+    "name, total, leg",
+    [
+        ("a1", 12.453, (0.696, 1.013, 0.226)), ("go1", 12.743448, (0.68, 1.009, 0.195862)),
+        ("hexapod", 30.508951, (1.20924, 0.925235, 0.281487 + 0.0190129)),  # its foot is part of the calf
+    ],
+)  # fmt: skip
+def test_weighs_what_its_source_says(name, total, leg):
+    """kg; Unitree's and the ElSpider Air's descriptions, of which a leg weighs 2.435."""
+    model = build_model(ROBOTS[name])
+    assert model.body_mass.sum() == pytest.approx(total, abs=1e-4)
+    for i, joint in enumerate(ROBOTS[name].joints):
+        assert model.body(joint).mass[0] == pytest.approx(leg[i % 3], abs=1e-6)
+
+
+def test_the_hexapod_stands_still():
+    """10 s of zero action: no foot creeps by a centimetre, no joint comes to rest at a stop."""
+    env = LocomotionEnv("hexapod", 1, num_threads=1, config=QUIET)
+    env.reset()
+    world, model = env.world, env.model
+    for _ in range(50):
+        env.step(np.zeros((1, 18)))
+    feet = []
+    for seconds in (0, 10):
+        for _ in range(round(seconds / CONTROL_DT)):
+            env.step(np.zeros((1, 18)))
+        data = mujoco.MjData(model)
+        data.qpos[:] = world.bind("qpos")[0]
+        mujoco.mj_kinematics(model, data)
+        feet.append(np.array([data.geom(f"{leg}_foot").xpos[:2] for leg in env.robot.legs]))
+    assert np.abs(feet[1] - feet[0]).max() < 0.01
+    angles, limits = data.qpos[env._angle_at], model.jnt_range[env._joints]
+    assert np.all(angles > limits[:, 0] + 0.05) and np.all(angles < limits[:, 1] - 0.05)
 
 
 @pytest.mark.parametrize("robot", ROBOTS.values(), ids=ROBOTS)
