@@ -321,7 +321,7 @@ GO1 = Robot(
 # the thighs point up and the calves down. The foot (0.019 kg) is part of the calf. Links are capsules as thick as
 # their boxes. Ours, where the sources are silent: armature and dry friction (the A1's), the start height. And the signs on
 # the left, where the URDF mirrors the axes, too: with its signs all six legs stand at the same angles, and ROLT, which has
-# no other way to tell left from right at first, learned to walk within a million steps but not to hold a course in 1.7.
+# no other way to tell left from right at first, learned to walk within a million steps but not to hold a course in 1.76.
 # The action scale is ours, too (the source: 0.2 to 0.5): the noise of exploration shakes this heavy robot with its stiff
 # joints about the vertical, by 0.6 rad/s at 0.25, which hides what steering earns; 0.4 at 0.15. (Both were changed at once.)
 HEXAPOD = Robot(

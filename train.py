@@ -1,6 +1,6 @@
 """Trains a policy: PPO on every core, or on a GPU.
 
-    python train.py --robot a1                            # ROLT on the stiffness task, 95 minutes on two cores
+    python train.py --robot a1                            # ROLT on the stiffness task, about 95 minutes on two cores
     python train.py --robot a1 --steps 20000              # does it run? a minute
     python train.py --robot a1 --resume                   # goes on where it was stopped (Ctrl-C is safe)
     python train.py --robot a1 --task terrain --init runs/a1-stiffness-rolt-seed0/checkpoint.pt    # stairs, after flat ground

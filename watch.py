@@ -56,7 +56,8 @@ class Show:
 
     def start(self) -> None:
         """A new episode in a new env."""
-        options = {"config": straight_ahead(self.speed, 3600), "extras": self.policy.extras, "terrain": self.terrain, "noise": self.noise}
+        options = {"extras": self.policy.extras, "terrain": self.terrain, "noise": self.noise}
+        options["config"] = straight_ahead(self.speed, 3600)
         self.env = LocomotionEnv(self.robot, 1, self.seed, 1, [(1.0, self.fault)], **options)
         self.observation = self.env.reset()
         self.model = render.painted(self.env, self.fault)
