@@ -153,6 +153,72 @@ def test_timeout_gives_the_true_last_observation_and_restarts():
     assert info["episode_lengths"].tolist() == [5, 5] and env.age.tolist() == [0, 0]
 
 
+# No chance but the command: what a test puts there stays.
+QUIET = EnvConfig(start_speed=0.0, push_speed=0.0, start_pose=(1.0, 1.0))
+REACH = 0.2 * np.cos(0.8) + 0.2 * np.cos(0.7) + 0.02  # m, trunk above ground in the default pose: thigh, calf, foot
+
+
+def test_air_time_of_a_fall_from_one_metre():
+    """sqrt(2 m / g) = 0.452 s: all four feet touch down at once, in the 23rd step (0.46 s)."""
+    env = LocomotionEnv("a1", 1, num_threads=1, config=QUIET)
+    env.reset()
+    env._qpos[0, 2], env.command[0, 0] = 1.0 + REACH, 0.5
+    for step in range(1, 25):
+        *_, info = env.step(np.zeros((1, 12)))
+        assert env.touchdown.all() == env.touchdown.any() == (step == 23)
+        assert env.foot_contact.all() == env.foot_contact.any() == (step >= 23)
+        assert info["rewards"]["foot_air_time"][0] == pytest.approx(4 * (0.46 - 0.5) if step == 23 else 0.0)
+
+
+def test_a_knee_on_the_ground_is_one_collision():
+    """The trunk one thigh above the ground: the front right calf lies on it, the other legs are folded up."""
+    env = LocomotionEnv("a1", 1, num_threads=1, config=QUIET)
+    env.reset()
+    angles = np.tile([0.0, 2.6, -2.69], (4, 1))
+    angles[0] = 0.0, 0.0, -np.pi / 2
+    env._qpos[0, 2], env._qpos[0, 7:] = 0.2, angles.ravel()
+    *_, info = env.step((angles - np.array(A1.default_pose)).reshape(1, 12) / A1.action_scale)
+    assert env.link_contact.tolist() == [[False, True] + 6 * [False]]  # thigh and calf of FR, FL, RR, RL
+    assert info["rewards"]["collision"][0] == -1.0
+
+
+def test_a_push_redraws_the_horizontal_velocity_when_it_is_due():
+    pushed, calm = (
+        LocomotionEnv("a1", 64, num_threads=1, config=EnvConfig(push_seconds=0.1, push_speed=speed)) for speed in (1.0, 0.0)
+    )
+    pushed.reset(), calm.reset()
+    for step in range(1, 6):
+        assert np.array_equal(pushed._qvel, calm._qvel)  # until now, the same
+        pushed.step(np.zeros((64, 12))), calm.step(np.zeros((64, 12)))
+    assert np.array_equal(pushed._qvel[:, 2:], calm._qvel[:, 2:])
+    velocity = pushed._qvel[:, :2]
+    assert np.abs(velocity).max() <= 1 and np.abs(velocity.mean()) < 0.2 and velocity.std() == pytest.approx(3**-0.5, rel=0.15)
+
+
+def test_friction_is_drawn_at_every_reset_one_number_a_robot():
+    env = LocomotionEnv("a1", 256, num_threads=1)
+    env.reset()
+    first = env._friction[:, :, 0].copy()
+    assert (first == first[:, :1]).all()  # all parts of a robot, and its ground
+    assert 0.5 <= first.min() < 0.52 and 1.23 < first.max() <= 1.25 and first[:, 0].mean() == pytest.approx(0.875, abs=0.05)
+    env._reset(np.arange(128))
+    assert (env._friction[:128, 0, 0] != first[:128, 0]).all() and (env._friction[128:, 0, 0] == first[128:, 0]).all()
+
+
+def test_friction_slows_a_sliding_robot():
+    """Standing on all fours and slung sideways at 2 m/s, it loses mu * g * t."""
+    env = LocomotionEnv("a1", 2, num_threads=1, config=QUIET)
+    env.reset()
+    friction = np.array([0.1, 0.3])
+    env._friction[:, :, 0] = friction[:, None]
+    for _ in range(40):
+        env.step(np.zeros((2, 12)))  # stand
+    env._qvel[:, 1] = 2.0
+    for _ in range(3):
+        env.step(np.zeros((2, 12)))
+    assert 2.0 - env._qvel[:, 1] == pytest.approx(friction * 9.81 * 3 * CONTROL_DT, rel=0.15)
+
+
 def test_a_robot_on_its_back_has_fallen_and_the_others_go_on():
     env = LocomotionEnv("a1", 3, num_threads=1)
     env.reset()

@@ -1,5 +1,6 @@
 """PPO's mathematics by hand, and the masks' way from the rollout into the update."""
 
+import copy
 import math
 
 import pytest
@@ -107,6 +108,46 @@ def test_first_minibatch_of_an_update_has_ratio_one():
     stats = learner.update(buffer, generator)
     assert abs(stats["kl"]) < 1e-6 and stats["clip_fraction"] == 0.0
     assert stats["surrogate"] == pytest.approx(0.0, abs=1e-5)  # - mean of ratio * normalised advantage
+
+
+def test_update_is_ppo_as_one_would_write_it_down(monkeypatch):
+    """Two epochs of three minibatches, each in one pass: the learner's flat buffer, micro-batches and minibatch indexing
+    against plain autograd, Adam and clip_grad_norm_."""
+    monkeypatch.setattr("rolt.ROLT.micro_batch", 40)
+    policy, critic, buffer, generator = rollout()
+    plain_policy, plain_critic = copy.deepcopy((policy, critic))
+    start, order = [p.clone() for p in policy.parameters()], torch.Generator().set_state(generator.get_state())
+    config = PPOConfig(epochs=2, minibatches=3)
+    learner = Learner(policy, critic, config)
+    stats = learner.update(buffer, generator)
+
+    parameters = [*plain_policy.parameters(), *plain_critic.parameters()]
+    groups = [{"params": plain_policy.parameters(), "lr": 1e-4}, {"params": plain_critic.parameters(), "lr": 1e-3}]
+    optimizer, norms, kls = torch.optim.Adam(groups), [], []
+    for _ in range(2):
+        for index in torch.randperm(24 * 8, generator=order).split(64):
+            batch = buffer.minibatch(index)
+            old = torch.distributions.Normal(batch["mean"], buffer.sigma)
+            new = torch.distributions.Normal(plain_policy(batch["observation"], batch["masks"]), plain_policy.sigma())
+            advantage = (buffer.value_target - buffer.value).flatten()  # before it was normalised
+            advantage = ((advantage - advantage.mean()) / advantage.std(correction=0))[index]
+            loss, _ = ppo_loss(
+                new.log_prob(batch["action"]).sum(1), batch["log_prob"], advantage, plain_critic(batch["observation"]),
+                batch["value"], batch["value_target"], new.entropy().sum(1), config,
+            )  # fmt: skip
+            optimizer.zero_grad()
+            loss.backward()
+            norms.append(torch.nn.utils.clip_grad_norm_(parameters, config.max_gradient_norm).item())
+            optimizer.step()
+            kls.append(torch.distributions.kl_divergence(old, new).sum(1).mean().item())
+    assert max(norms) > config.max_gradient_norm  # clipping has been at work
+    for (name, ours), plain, before in zip(policy.named_parameters(), plain_policy.parameters(), start):
+        if not name.endswith("key.bias"):  # softmax does not see it: its gradient is rounding, which Adam makes large
+            assert torch.allclose(ours, plain, atol=2e-6), name
+            assert not torch.allclose(ours, before, atol=2e-5), name
+    assert all(torch.allclose(a, b, atol=2e-5) for a, b in zip(critic.parameters(), plain_critic.parameters()))
+    assert stats["kl"] == pytest.approx(sum(kls) / 6, rel=0.01)
+    assert learner.learning_rate == adapt_learning_rate(1e-4, stats["kl"], config.target_kl)
 
 
 def test_micro_batches_sum_to_the_minibatch(monkeypatch):
