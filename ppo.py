@@ -73,9 +73,9 @@ def seen(observation: Observation) -> tuple:
 
 def pack_bits(mask: Tensor) -> Tensor:
     """(B, ...) bool -> (B, ceil(bits / 8)) uint8, eight decisions a byte."""
-    bits = mask.flatten(1).to(torch.uint8)
-    bits = nn.functional.pad(bits, (0, -bits.shape[1] % 8)).unflatten(1, (-1, 8))  # (B, bytes, 8)
-    return (bits << torch.arange(8, dtype=torch.uint8, device=mask.device)).sum(-1, dtype=torch.uint8)
+    bits = mask.flatten(1)
+    bits = nn.functional.pad(bits, (0, -bits.shape[1] % 8)).view(torch.int64)  # eight bytes of 0 or 1 in each number
+    return (bits * 0x0102040810204080 >> 56).to(torch.uint8)  # moves byte i's lowest bit to bit 56 + i, the rest elsewhere
 
 
 def unpack_bits(packed: Tensor, shape: tuple[int, ...]) -> Tensor:

@@ -59,6 +59,7 @@ def test_learning_rate_follows_the_kl():
 def test_packed_masks_come_back(shape):
     mask = torch.rand(7, *shape, generator=torch.Generator().manual_seed(0)) < 0.6
     packed = pack_bits(mask)
+    assert pack_bits(torch.eye(8) > 0).flatten().tolist() == [1, 2, 4, 8, 16, 32, 64, 128]
     assert packed.dtype == torch.uint8 and packed.shape == (7, math.ceil(math.prod(shape) / 8))
     assert torch.equal(unpack_bits(packed, shape), mask.float())
 
@@ -116,7 +117,8 @@ def test_update_is_ppo_as_one_would_write_it_down(monkeypatch):
     monkeypatch.setattr("rolt.ROLT.micro_batch", 40)
     policy, critic, buffer, generator = rollout()
     plain_policy, plain_critic = copy.deepcopy((policy, critic))
-    start, order = [p.clone() for p in policy.parameters()], torch.Generator().set_state(generator.get_state())
+    start = [p.clone() for module in (policy, critic) for p in module.parameters()]
+    order = torch.Generator().set_state(generator.get_state())
     config = PPOConfig(epochs=2, minibatches=3)
     learner = Learner(policy, critic, config)
     stats = learner.update(buffer, generator)
@@ -141,11 +143,10 @@ def test_update_is_ppo_as_one_would_write_it_down(monkeypatch):
             optimizer.step()
             kls.append(torch.distributions.kl_divergence(old, new).sum(1).mean().item())
     assert max(norms) > config.max_gradient_norm  # clipping has been at work
-    for (name, ours), plain, before in zip(policy.named_parameters(), plain_policy.parameters(), start):
+    trained = [*policy.named_parameters(), *critic.named_parameters()]
+    for (name, ours), plain, before in zip(trained, parameters, start):
         if not name.endswith("key.bias"):  # softmax does not see it: its gradient is rounding, which Adam makes large
-            assert torch.allclose(ours, plain, atol=2e-6), name
-            assert not torch.allclose(ours, before, atol=2e-5), name
-    assert all(torch.allclose(a, b, atol=2e-5) for a, b in zip(critic.parameters(), plain_critic.parameters()))
+            assert (ours - plain).norm() < 0.005 * (ours - before).norm(), name
     assert stats["kl"] == pytest.approx(sum(kls) / 6, rel=0.01)
     assert learner.learning_rate == adapt_learning_rate(1e-4, stats["kl"], config.target_kl)
 

@@ -8,7 +8,7 @@ import torch
 from baselines import make_policy
 from env import Observation
 from robots import A1
-from rolt import ROLT, ROLTConfig, add_dropped, drop
+from rolt import ROLT, ROLTConfig, add_dropped, draw_mask, drop
 
 
 def observation(n=5, legs=4, seed=0):
@@ -85,6 +85,16 @@ def test_drop_scales_what_it_keeps():
     keep = torch.tensor([[True, False, True], [False, True, True]])
     assert torch.allclose(drop(x, keep, 0.1), torch.tensor([[10.0, 0, 10], [0, 10, 10]]))
     assert drop(x, None, 0.1) is x
+
+
+@pytest.mark.parametrize("p", [0.1, 0.75])
+def test_the_four_decisions_of_one_random_number_are_fair_and_independent(p):
+    drops = ~draw_mask((40_000, 4), p, torch.Generator().manual_seed(0))
+    assert draw_mask((3, 5), p, torch.Generator()).shape == (3, 5)  # not a multiple of four
+    for i in range(4):
+        for j in range(4):
+            rate = p if i == j else p * p  # of both at once
+            assert abs((drops[:, i] & drops[:, j]).float().mean() - rate) < 5 * (rate * (1 - rate) / 40_000) ** 0.5
 
 
 def test_masks_change_the_action_and_repeat_it():
