@@ -119,7 +119,7 @@ def test_update_is_ppo_as_one_would_write_it_down(monkeypatch):
     plain_policy, plain_critic = copy.deepcopy((policy, critic))
     start = [p.clone() for module in (policy, critic) for p in module.parameters()]
     order = torch.Generator().set_state(generator.get_state())
-    config = PPOConfig(epochs=2, minibatches=3)
+    config = PPOConfig(epochs=2, minibatches=3, max_gradient_norm=4.0)
     learner = Learner(policy, critic, config)
     stats = learner.update(buffer, generator)
 
@@ -142,7 +142,7 @@ def test_update_is_ppo_as_one_would_write_it_down(monkeypatch):
             norms.append(torch.nn.utils.clip_grad_norm_(parameters, config.max_gradient_norm).item())
             optimizer.step()
             kls.append(torch.distributions.kl_divergence(old, new).sum(1).mean().item())
-    assert max(norms) > config.max_gradient_norm  # clipping has been at work
+    assert min(norms) < config.max_gradient_norm < max(norms)  # some were clipped
     trained = [*policy.named_parameters(), *critic.named_parameters()]
     for (name, ours), plain, before in zip(trained, parameters, start):
         if not name.endswith("key.bias"):  # softmax does not see it: its gradient is rounding, which Adam makes large
