@@ -110,7 +110,7 @@ def report_curves(args, rows: list[dict], scales: tuple[float, ...], name: str, 
     print_falls(args, rows, cases, labels)
     print(f"\ndistance at {labels[-1]}, of the clean one")
     for method, (mean, _) in panels["distance walked [m]"].items():
-        print(f"{method:28}{mean[-1] / mean[0]:>14.0%}")
+        print(f"{method:28}" + (f"{mean[-1] / mean[0]:>14.0%}" if mean[0] > 0.5 else "  stands with clean heights, too"))
     curves(panels, scales, args.out / f"{name}.png", title, axis)
     print(f"\nwritten: {args.out / f'{name}.csv'}, {args.out / f'{name}.png'}")
 

@@ -154,7 +154,7 @@ def test_noise_tests_and_attention_on_stairs(tmp_path, capsys):
     test = ["--checkpoints", *files, "--episodes", "1", "--seconds", "0.1", "--threads", "1", "--out", str(tmp_path)]
     for name in ("low_frequency", "high_frequency"):
         evaluate.main([name, *test])
-        assert [row["case"] for row in rows(tmp_path / f"{name}.csv")][::2] == ["0", "0.05", "0.1", "0.2", "0.4", "0.8"]
+        assert [row["case"] for row in rows(tmp_path / f"{name}.csv")][::2] == ["0", "0.05", "0.1", "0.2", "0.4", "0.8", "1.6"]
     evaluate.main(["attention", *test])
     entropies = [float(line.split()[-1]) for line in capsys.readouterr().out.splitlines() if "entropy" in line]
     assert len(entropies) == 4 and min(entropies) > 0.95  # a gaze that has learned nothing is even
