@@ -24,11 +24,11 @@ from torch import Tensor, nn
 from torch.utils.benchmark import Timer
 
 from env import HISTORY, LocomotionEnv, Observation
-from faults import TASKS, Fault, Task
+from faults import TASKS, Fault, Task, first_task
 from normalizer import Normalizer
 from ppo import Learner, PPOConfig, to_tensors
 from robots import ROBOTS, Robot
-from rolt import ROLT, SIGMA_BOUNDS, Masks, ROLTConfig, drop
+from rolt import LOG_SIGMA_BOUNDS, ROLT, Masks, ROLTConfig, drop
 from scandots import SCAN_SHAPE
 
 HIDDEN = (512, 256, 128)  # legged_gym
@@ -74,7 +74,7 @@ class Policy(nn.Module):
     micro_batch = 1024  # more than ROLT's: wide layers and few activations
 
     def sigma(self) -> Tensor:
-        return self.log_sigma.clamp(*SIGMA_BOUNDS).exp()
+        return self.log_sigma.clamp(*LOG_SIGMA_BOUNDS).exp()
 
     def sample_masks(self, n: int, generator: torch.Generator) -> Masks:
         return {}
@@ -327,6 +327,9 @@ METHODS = {
 }
 
 
+STAGED = tuple(name for name, method in METHODS.items() if hasattr(method, "stages"))  # trained in more than one way
+
+
 def make_policy(name: str, robot: Robot, task: Task = TASKS["stiffness"]) -> nn.Module:
     """A policy for the robot, with fresh weights from torch's global generator. The task matters to ROAM alone."""
     options = {"num_situations": len(task.training)} if name == "roam" else {}
@@ -335,7 +338,7 @@ def make_policy(name: str, robot: Robot, task: Task = TASKS["stiffness"]) -> nn.
 
 def training_stages(policy: nn.Module, task: Task) -> list[Stage]:
     """How the policy is trained, one stage after the other; their shares of the steps add up to 1."""
-    if isinstance(policy, RMA | ROAM):
+    if hasattr(policy, "stages"):
         return policy.stages(task)
     return [Stage("ppo", 1.0, task.training, policy, (policy,))]
 
@@ -345,7 +348,7 @@ def main() -> None:
     for robot in ROBOTS.values():
         print(f"{robot.name:18}{'parameters':>12}{'one robot acts in':>20}{'256 robots':>14}   (one thread)")
         for name in METHODS:
-            policy, times = make_policy(name, robot).eval(), []
+            policy, times = make_policy(name, robot, TASKS[first_task(robot.name)]).eval(), []
             for n in (1, 256):
                 observation = to_tensors(LocomotionEnv(robot, n, extras=policy.extras).reset(), "cpu")
                 times.append(Timer("policy(observation)", globals={"policy": policy, "observation": observation}))

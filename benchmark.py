@@ -28,10 +28,10 @@ import torch.distributed as dist
 import torch.multiprocessing as mp
 from torch import Tensor, nn
 
-from baselines import METHODS, make_policy
+from baselines import METHODS, STAGED, make_policy
 from cli import Parser, count, num_cores
 from env import CONTROL_DT, LocomotionEnv
-from faults import TASKS
+from faults import TASKS, first_task
 from ppo import Critic, Learner, PPOConfig, RolloutBuffer, all_reduce, collect, to_tensors
 from robots import ROBOTS
 from rolt import EncoderLayer
@@ -41,6 +41,9 @@ try:
     import resource
 except ImportError:  # Windows
     resource = None
+
+
+ONE_STAGE = tuple(name for name in METHODS if name not in STAGED)  # what one critic and one learner train
 
 
 def seconds(function, clock=time.perf_counter) -> float:
@@ -63,8 +66,7 @@ def timed(function, times: list[float]):
 
 def make_env(robot: str, num_envs: int, seed: int, threads: int, **options) -> LocomotionEnv:
     """With the faults of the first task that is for this robot, as train.py has it by default."""
-    task = next(task for task in TASKS.values() if robot in task.robots)
-    return LocomotionEnv(robot, num_envs, seed, threads, task.training, **options)
+    return LocomotionEnv(robot, num_envs, seed, threads, TASKS[first_task(robot)].training, **options)
 
 
 # ---------------------------------------------------------------------- one part at a time
@@ -240,7 +242,7 @@ def show(title: str, figures: dict[str, float], report: dict[str, float]) -> Non
 def main(argv: list[str] | None = None) -> None:
     parser = Parser(__doc__)
     parser.add_argument("--robots", nargs="+", choices=ROBOTS, default=["a1", "hexapod"])
-    parser.add_argument("--policies", nargs="+", choices=METHODS, default=["rolt", "mlp"])
+    parser.add_argument("--policies", nargs="+", choices=ONE_STAGE, default=["rolt", "mlp"])
     parser.add_argument("--envs", type=count, default=256, help="robots simulated; each rank of the training has a quarter")
     parser.add_argument("--rounds", type=count, default=20, help="fewer are quicker and noisier")
     parser.add_argument("--threads", type=count, default=num_cores(), help="of the simulation, and ranks (default: cores)")

@@ -62,12 +62,12 @@ CONTROL_DT = SUBSTEPS * PHYSICS_DT  # s
 HISTORY = 10  # steps (paper, section III-A)
 LONG_HISTORY = 50  # steps that RMA's adaptation reads (Kumar et al. 2021)
 EXTRAS = ("privileged", "past", "situation")
-MAX_ACTION = 10.0  # ours: 2.5 rad from the default pose reaches every joint limit
+MAX_ACTION = 10.0  # ours: 2.5 rad (hexapod: 1.5) from the default pose, far beyond what walking needs
 MAX_SPEED = 1000.0  # m/s and rad/s, ours: flailing at the motors' limits reaches 100; beyond is a simulation that ran away
 MAX_TILT = np.cos(np.deg2rad(60))  # ours: past 60 degrees no robot here gets up again; legged_gym waits for contact
 SAVED_ARRAYS = (
-    "action", "last_action", "history", "command", "heading", "air_time", "age", "command_age", "episode_return", "fault_index",
-    "_last_contact", "row", "start",
+    "action", "last_action", "history", "command", "heading", "air_time", "age", "first_age", "command_age", "episode_return",
+    "fault_index", "_last_contact", "row", "start",
 )  # fmt: skip
 
 
@@ -164,7 +164,8 @@ class LocomotionEnv:
         self.history = np.zeros((num_envs, self.num_legs, memory, 12 + 3 * self.num_joints), dtype=np.float32)
         self.command, self.heading = np.zeros((num_envs, 3)), np.zeros(num_envs)
         self.air_time, self._last_contact = np.zeros(shape[:2]), np.zeros(shape[:2], dtype=bool)
-        self.age, self.command_age = np.zeros((2, num_envs), dtype=int)  # (N,) steps since the reset, since the command
+        # (N,) steps: since the reset, of which not lived (`random_ages`), since the command
+        self.age, self.first_age, self.command_age = np.zeros((3, num_envs), dtype=int)
         self.episode_return = np.zeros(num_envs)
         self.divergences = 0  # simulations that were given up, in total
         self.row, self.start = np.zeros(num_envs, dtype=int), np.zeros((num_envs, 2))  # where on the terrain it began, m
@@ -186,8 +187,7 @@ class LocomotionEnv:
             self.row[:] = self.rng.integers(min(self.config.start_rows, len(self.terrain.levels)), size=self.num_envs)
         self._reset(everyone)
         if random_ages:
-            self.age[:] = self.rng.integers(self.episode_steps, size=self.num_envs)
-            self.command_age[:] = self.age
+            self.age[:] = self.first_age[:] = self.command_age[:] = self.rng.integers(self.episode_steps, size=self.num_envs)
         return self.observe()
 
     def step(self, action: np.ndarray) -> tuple[Observation, np.ndarray, np.ndarray, np.ndarray, dict]:
@@ -204,7 +204,7 @@ class LocomotionEnv:
             info: of the state that the step led to, before any reset: "rewards" {term: (N,)} weighted, per second,
                 "position" (N, 3) m, "speed" and "commanded_speed" forward (N,) m/s, "diverged" (N,) bool. Of time-outs:
                 "truncated_ids" (n,) and "final_observation" (n rows), the true last observations to bootstrap from.
-                Of all n finished episodes: "episode_returns" and "episode_lengths" (n,), in steps.
+                Of all n finished episodes: "episode_returns" and "episode_lengths" (n,), in steps lived.
         """
         action = np.asarray(action, dtype=np.float64).reshape(self.action.shape)
         if not np.isfinite(action).all():
@@ -236,7 +236,7 @@ class LocomotionEnv:
         ended = np.flatnonzero(terminated | truncated)
         info["truncated_ids"] = np.flatnonzero(truncated)
         info["final_observation"] = self.observe(np.flatnonzero(truncated))
-        info["episode_returns"], info["episode_lengths"] = self.episode_return[ended].copy(), self.age[ended].copy()
+        info["episode_returns"], info["episode_lengths"] = self.episode_return[ended].copy(), (self.age - self.first_age)[ended]
         if len(ended):
             self._climb(ended[~diverged[ended]])  # whose position is none
             self._reset(ended)
@@ -283,7 +283,7 @@ class LocomotionEnv:
 
         self.action[ids] = self.last_action[ids] = 0.0
         self.air_time[ids], self._last_contact[ids] = 0.0, False
-        self.age[ids] = 0
+        self.age[ids] = self.first_age[ids] = 0
         self.episode_return[ids] = 0.0
         self._read_state()
         self._resample_commands(ids[self.command_age[ids] >= round(config.command_seconds / CONTROL_DT)])
@@ -328,7 +328,7 @@ class LocomotionEnv:
     # ------------------------------------------------------------------ going on after a break
 
     def state_dict(self) -> dict:
-        """All that the next step depends on (arrays, lists and numbers)."""
+        """All that the next step depends on, but for noise on the scan, which is for tests (arrays, lists and numbers)."""
         arrays = {name: getattr(self, name).copy() for name in SAVED_ARRAYS}
         world = {"state": self.world.state.copy(), "friction": self._friction.copy()}
         return arrays | world | {"random": self.rng.bit_generator.state, "divergences": self.divergences}

@@ -12,11 +12,12 @@
     python evaluate.py watch --robot a1 --fault lock:FR_calf     # a viewer; see watch.py, or watch --help
 
 Each prints a table and writes EXPERIMENT.csv (one row an episode) and EXPERIMENT.png to --out (default: results).
-Policies act by their mean, without dropout. The same seed and the same number of threads give the same numbers.
+Policies act by their mean, without dropout (ROAM draws which of its behaviours acts). The same seed and the same number of threads give the same numbers.
 """
 
 import os
 import sys
+from collections import Counter
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -29,7 +30,7 @@ from baselines import METHODS
 from checkpoint import CheckpointError, load_policy
 from cli import Parser, count, fail, num_cores, positive, seed, threads, writable_folder
 from env import CONTROL_DT, LocomotionEnv
-from faults import REAL_WORLD, TASKS, healthy
+from faults import REAL_WORLD, TASKS, first_task, healthy
 from gaits import gaits
 from noise import ScanNoise, missing_points
 from paper import DAMAGE
@@ -43,7 +44,7 @@ from scandots import HEIGHT_SCALE, NUM_PATCHES, as_patches
 from terrain import Terrain, rise
 
 STAIRS_LEVEL = 0  # of the noise tests, ours: steps of 5 cm, the easiest of legged_gym
-NOISE_SCALES = (0.0, 0.05, 0.1, 0.2, 0.4, 0.8, 1.6)  # m, ours: up to where most patches read what env.py clips heights to
+NOISE_SCALES = (0.0, 0.05, 0.1, 0.2, 0.4, 0.8, 1.6)  # m, ours: up to where half of the points read what heights are clipped to
 
 
 def stiffness(args) -> None:
@@ -138,8 +139,8 @@ def attention(args) -> None:
             weights = weights[0, -1, :, :, -NUM_PATCHES:].mean((0, 1)).numpy()
             weights /= weights.sum()
             entropy = -(weights * np.log(weights)).sum() / np.log(NUM_PATCHES)
-            print(f"{card['policy']:12}{title:20} on the 4 patches {weights[patches].sum():6.1%}, entropy {entropy:.3f}")
-            panels[title][card["policy"]] = weights
+            print(f"{card['method']:16}{title:20} on the 4 patches {weights[patches].sum():6.1%}, entropy {entropy:.3f}")
+            panels[title][card["method"]] = weights
     attention_maps(panels, args.out / "attention.png")
     print(f"\nwritten: {args.out / 'attention.png'}")
 
@@ -238,15 +239,19 @@ def find_policies(args) -> dict[Path, tuple]:
         paths = [path for path in named.values() if path.is_file()]
         missing = [method for method, path in named.items() if not path.is_file()]
         if missing:
-            train = f"python train.py --robot {args.robot} --task {task} --policy {missing[0] if len(missing) == 1 else 'all'}"
-            print(f"not trained yet: {', '.join(missing)}; {train}, then --checkpoints")
+            train = f"python train.py --robot {args.robot} --task {task} --policy {missing[0]}"
+            train += " --init FILE, a policy that walks on flat ground" * bool(TASKS[task].terrain)
+            print(f"not trained yet: {', '.join(missing)} ({train}; then --checkpoints)")
         if not paths:
             fail("nothing to evaluate: name files with --checkpoints")
     try:
         policies = {path: load_policy(path, args.robot) for path in paths}
     except CheckpointError as error:
         fail(error)
-    for path, (_, card) in policies.items():
+    alike = Counter((card["policy"], card["seed"]) for _, card in policies.values())
+    for path, (_, card) in policies.items():  # seeds are put together in the tables, other variants of a method are not
+        variant = path.parent.name if path.name == "policy.pt" else path.stem
+        card["method"] = card["policy"] + f" ({variant})" * (alike[card["policy"], card["seed"]] > 1)
         print(f"{card['policy']}: {path} ({card['steps'] / 1e6:.1f}M steps, seed {card['seed']})", flush=True)
     return policies
 
@@ -293,7 +298,7 @@ def main(argv: list[str] | None = None) -> None:
     args.methods = args.methods or defaults.get("methods")
     if args.robot not in robots:
         fail(f"the test {args.experiment} is for {', '.join(robots)}, not for {args.robot}")
-    args.task = task or next(name for name, other in TASKS.items() if args.robot in other.robots)
+    args.task = task or first_task(args.robot)
     if args.seconds < CONTROL_DT:
         fail(f"an episode lasts at least {CONTROL_DT} s, not {args.seconds:g}")
     args.policies = find_policies(args)

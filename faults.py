@@ -12,8 +12,8 @@ robots.py. Sections IV-A and IV-C of the paper:
     skate     "roller skates are tied to [the] feet"      skate("FR")           likewise
 
 The last two need what a robot alone does not have: the env builds it for the faults that it is made with.
-Faults add up: lock("FR_calf") + weaken("RL", 0.5). A new fault is a field of `Fault`, a line in `write_fault` and a
-function that makes it.
+Faults add up: lock("FR_calf") + weaken("RL", 0.5). A new fault is a field of `Fault`, a line in `write_fault`, a function
+that makes it, and a word for it in `Fault.__str__` and `parse`: its name in tables, options and checkpoints.
 
     python faults.py            # lists the faults and the training tasks
 """
@@ -227,6 +227,14 @@ TASKS = {
     # Section IV-B: healthy, "on multiple terrains, including stairs, slopes and platforms"; the test is noise (noise.py).
     "terrain": Task(robots=("a1",), training=((1.0, healthy()),), unseen=(), terrain=TRAINING_MAP),
 }
+
+
+def first_task(robot: str) -> str:
+    """The name of the first task that is for this robot: what it is trained and shown on unless told otherwise."""
+    for name, task in TASKS.items():
+        if robot in task.robots:
+            return name
+    raise ValueError(f"no task in faults.py is for the robot {robot}: name it in one of TASKS")
 
 
 # Section IV-C: "we weaken the motor strength of one leg and lock the hind back leg with a string", "pull a box with one

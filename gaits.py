@@ -74,14 +74,14 @@ def gaits(args) -> None:
     if problem:
         print(f"no frames, numbers only: {problem}")
     for path, (policy, card) in args.policies.items():
-        print(f"\n{card['policy']}")
+        print(f"\n{card['method']}")
         faults = [cases[case] for case, _ in labels]
         walk = render.record(policy, args.robot, faults, args.seconds, 0.75, args.seed, args.threads)
         measured = [measure(walk.contacts[:end, i], CONTROL_DT) for i, end in enumerate(walk.steps)]
         print_table(list(cases), robot.legs, [measured[i : i + args.episodes] for i in range(0, len(labels), args.episodes)])
 
         for (case, episode), end, gait in zip(labels, walk.steps, measured):
-            row = {"method": card["policy"], "checkpoint": str(path), "seed": card["seed"], "case": case, "episode": episode}
+            row = {"method": card["method"], "checkpoint": str(path), "seed": card["seed"], "case": case, "episode": episode}
             for i, leg in enumerate(robot.legs):
                 numbers = {name: "" for name in ("duty_factor", "stride_hz", "feet_down")}
                 if gait is not None:
@@ -89,7 +89,7 @@ def gaits(args) -> None:
                 rows.append(row | {"seconds": f"{end * CONTROL_DT:.2f}", "leg": leg} | numbers)
 
         unseen = {case: " (unseen)" if fault in task.unseen else "" for case, fault in cases.items()}
-        titles = [f"{card['policy']}, {fault}{unseen[case]}" for case, fault in cases.items()]
+        titles = [f"{card['method']}, {fault}{unseen[case]}" for case, fault in cases.items()]
         panels.append([panel(walk, i * args.episodes, title, framed=not problem) for i, title in enumerate(titles)])
     csv, picture = (args.out / f"gaits-{args.robot}.{suffix}" for suffix in ("csv", "png"))
     write_csv(csv, rows)

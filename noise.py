@@ -126,7 +126,7 @@ def main() -> None:
     from plots import scans  # not above: training needs no matplotlib for its noise
 
     stairs, rng = Terrain(("stairs",), (3,)), np.random.default_rng(0)
-    position, yaw = np.array([[1.4, 0.0, 0.45]]), np.zeros(1)  # where a robot stands on the third step
+    position, yaw = np.array([[1.4, 0.0, 0.6]]), np.zeros(1)  # where a robot stands on the third step
     low, high = ScanNoise(offset=0.3), ScanNoise(sigma=0.1)
     panels = {
         "clean": scan(stairs, position, yaw),

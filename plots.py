@@ -9,6 +9,8 @@ matplotlib.use("Agg")  # files only: works without a display
 import matplotlib.pyplot as plt  # noqa: E402
 import numpy as np  # noqa: E402
 
+from scandots import PATCH, SCAN_SHAPE  # noqa: E402
+
 
 def learning_curve(progress: Path, picture: Path) -> None:
     """Draws the run's progress.csv: return, speed against the command, episode length, sigma and KL over steps."""
@@ -111,7 +113,7 @@ def scans(panels: dict[str, np.ndarray], picture: Path, title: str) -> None:
     low, high = min(p.min() for p in panels.values()), max(p.max() for p in panels.values())
     for axis, (label, heights) in zip(axes, panels.items()):
         image = axis.imshow(heights[::-1, ::-1], cmap="viridis", vmin=low, vmax=high)
-        draw_patches(axis, heights.shape, 4)
+        draw_patches(axis, heights.shape, PATCH)
         axis.set_title(label, fontsize=9)
     figure.colorbar(image, ax=axes, shrink=0.8)
     figure.suptitle(title, fontsize=10)
@@ -125,10 +127,10 @@ def attention_maps(panels: dict[str, dict[str, np.ndarray]], picture: Path) -> N
     for line, (situation, row) in zip(axes, panels.items()):
         for axis, (name, values) in zip(line, row.items()):
             heights = name == "heights"
-            grid = values if heights else values.reshape(4, 3)
+            grid = values if heights else values.reshape(SCAN_SHAPE[0] // PATCH, -1)
             limits = {} if heights else {"vmin": 0, "vmax": max(0.25, values.max())}
             image = axis.imshow(grid[::-1, ::-1], cmap="viridis" if heights else "magma", **limits)
-            draw_patches(axis, grid.shape, 4 if heights else 1)
+            draw_patches(axis, grid.shape, PATCH if heights else 1)
             axis.set_title(f"{situation}: {'heights [m]' if heights else name}", fontsize=9)
             figure.colorbar(image, ax=axis, shrink=0.7)
     save_figure(figure, picture)

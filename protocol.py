@@ -5,6 +5,7 @@ method, checkpoint, seed (of the training), case, episode, distance_m, fall_time
 """
 
 import csv
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -32,7 +33,7 @@ def run_episodes(
     """One episode `straight_ahead` on each of len(faults) robots, robot i with faults[i].
 
     env_options: of LocomotionEnv, such as terrain and noise. A fall is what ends an episode in training: the trunk touches
-    the ground or tilts by more than 60 degrees.
+    the ground or tilts by more than 60 degrees, or the simulation diverges (that is said on stderr).
 
     Returns (N,) each: distance_m, net displacement along the commanded heading up to the first fall or the end;
     fall_time_s, of the first fall, `seconds` if there is none; episode_return, the reward up to then.
@@ -54,14 +55,19 @@ def run_episodes(
         upright &= ~terminated
         if not upright.any():
             break
+    if env.divergences:
+        print(f"{env.divergences} simulations diverged and count as falls", file=sys.stderr)
     return {"distance_m": distance, "fall_time_s": fall_time, "episode_return": returns}
 
 
 def case_name(fault: Fault) -> str:
-    """healthy, FL for a locked FL_calf, FLC for a dead motor of FL_calf"""
-    if fault.locked:
-        return fault.locked[0].split("_")[0]
-    return fault.strength[0][0].replace("_", "")[:3].upper() if fault.strength else "healthy"
+    """In the paper's words: FL is a locked FL_calf, FLC a dead motor of FL_calf; what it has no word for by its own name."""
+    match str(fault).replace("_", ":").split(":"):
+        case ["lock", leg, "calf"]:
+            return leg
+        case ["disable", leg, joint]:
+            return leg + joint[0].upper()
+    return str(fault)
 
 
 def run_cases(args, cases: dict[str, Fault], speed: float, **env_options) -> list[dict]:
@@ -80,7 +86,7 @@ def run_cases(args, cases: dict[str, Fault], speed: float, **env_options) -> lis
             print_choices(policy.picked, [str(fault) for _, fault in TASKS[card["task"]].training], list(cases))
         for i, (case, episode) in enumerate(labels):
             measured = {name: f"{values[i]:.4f}" for name, values in outcome.items()}
-            row = {"method": card["policy"], "checkpoint": str(path), "seed": card["seed"], "case": case}
+            row = {"method": card["method"], "checkpoint": str(path), "seed": card["seed"], "case": case}
             rows.append(row | {"episode": episode} | measured)
     return rows
 
@@ -144,7 +150,7 @@ def print_falls(args, rows: list[dict], cases: list[str], labels: list[str]) -> 
 
 
 def print_choices(picked: torch.Tensor, behaviours: list[str], cases: list[str]) -> None:
-    """Of ROAM: the share of each behaviour (K of them) in all steps of a case. picked: (cases * episodes, K) steps."""
+    """Of ROAM: the share of each behaviour (K of them) in all steps of a case, after falls too. picked: (cases * episodes, K) steps."""
     shares = picked.unflatten(0, (len(cases), -1)).sum(1)  # (cases, K)
     shares /= shares.sum(1, keepdim=True)
     print(f"\n{'roam chooses':28}" + "".join(f"{case:>{column_width(cases)}}" for case in cases))

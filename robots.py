@@ -5,7 +5,7 @@ A robot is a trunk and L equal legs of J joints; nothing below knows more than t
 are its mirror image in y, rear legs in x where `Link.rear_mirrors_x` says so.
 
 What a fault (faults.py) will change on one robot is prepared here, so that a fault is only numbers:
-    joint lock      an inactive equality constraint a joint        -> eq_active, eq_data
+    joint lock      an inactive equality constraint a joint        -> eq_active
     motor strength  a position actuator a joint                    -> actuator_gainprm, _biasprm, _forcerange
     friction        the robot's geoms decide it (priority 1)       -> geom_friction
     half-lock       a joint's stops                                -> jnt_range
@@ -30,7 +30,7 @@ PHYSICS_DT = 0.005  # s, legged_gym: 200 Hz physics, 4 substeps a control step o
 BOX_MASS = 4.0  # kg, a third of a Go1
 BOX_FRICTION = 0.5  # cardboard on a floor: 20 N to drag it, a sixth of a Go1's weight, on one leg
 BOX_SIZE = (0.3, 0.3, 0.2)  # m
-BOX_START = (-0.95, 0.0, 0.1)  # m, behind the robot: no leg's tether is taut at first
+BOX_START = (-0.95, 0.0, 0.1)  # m, behind the robot: no hind leg's tether is taut at first
 TETHER = 0.8  # m
 SLACK = 1000.0  # m, the length of a tether that nobody has tied
 WHEEL_MASS = 0.1  # kg

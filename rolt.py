@@ -26,9 +26,9 @@ from torch import Tensor, nn
 
 from env import HISTORY, Observation
 from normalizer import Normalizer
-from scandots import SCAN_SHAPE
+from scandots import NUM_PATCHES, PATCH, SCAN_SHAPE
 
-SIGMA_BOUNDS = (math.log(0.05), math.log(2.0))  # ours
+LOG_SIGMA_BOUNDS = (math.log(0.05), math.log(2.0))  # ours
 
 Masks = dict[str, Tensor]  # name -> (B, ...), True or 1 = keep; empty for a policy without dropout
 
@@ -41,7 +41,6 @@ class ROLTConfig:
     layers: int = 2  # paper
     heads: int = 4  # ours: the paper names no number; 4 heads of 40
     feedforward: int = 320  # ours: twice the width keeps it light
-    patch: int = 4  # points a side; 16 x 12 points make the paper's 12 patches
     # ours: legged_gym's 1.0 falls for longer first; a run from 0.5 (on an earlier env) only learned to stand
     initial_sigma: float = 0.7
     feature_dropout: float = 0.1  # paper; 0 = the ablation No Feature Drop
@@ -115,16 +114,15 @@ class ROLT(nn.Module):
         super().__init__()
         self.config, self.num_legs, self.num_joints = config, num_legs, num_joints
         self.normalizer = Normalizer(num_joints)
-        D, rows, columns = config.width, SCAN_SHAPE[0] // config.patch, SCAN_SHAPE[1] // config.patch
-        self.num_patches = rows * columns
+        D = config.width
         frame = 3 * num_joints + 12  # numbers that one leg sees in one step
         self.leg_embedding = nn.Sequential(nn.Linear(HISTORY * frame, D), nn.GELU(), nn.Linear(D, D))
         if config.leg_pe:
             self.leg_position = nn.Parameter(0.02 * torch.randn(num_legs, D))  # 0.02: ViT's scale
         else:
             self.action_embedding = nn.Linear(num_legs * num_joints, D)
-        self.patch_embedding = nn.Linear(config.patch**2, D)
-        self.patch_position = nn.Parameter(0.02 * torch.randn(self.num_patches, D))  # p_e
+        self.patch_embedding = nn.Linear(PATCH**2, D)
+        self.patch_position = nn.Parameter(0.02 * torch.randn(NUM_PATCHES, D))  # p_e
         if config.pe_dropout > 0:
             self.dropped_position = nn.Parameter(0.02 * torch.randn(D))  # stands in for every dropped p_e
         self.encoder = nn.ModuleList(EncoderLayer(config) for _ in range(config.layers))
@@ -141,14 +139,14 @@ class ROLT(nn.Module):
 
     def sigma(self) -> Tensor:
         """(L*J,) standard deviation of every action, within bounds that no healthy run meets."""
-        return self.log_sigma.clamp(*SIGMA_BOUNDS).exp().repeat(self.num_legs)
+        return self.log_sigma.clamp(*LOG_SIGMA_BOUNDS).exp().repeat(self.num_legs)
 
     def sample_masks(self, n: int, generator: torch.Generator) -> Masks:
         """Dropout masks for n samples: (n, P) patches that keep their p_e, (n, tokens, D) features that are kept."""
 
         config, masks = self.config, {}
         if config.pe_dropout > 0:
-            masks["patch_position"] = draw_mask((n, self.num_patches), config.pe_dropout, generator)
+            masks["patch_position"] = draw_mask((n, NUM_PATCHES), config.pe_dropout, generator)
         if config.feature_dropout > 0:
             for i in range(len(self.encoder)):
                 shape = (n, self._queries(i), config.width)
@@ -174,9 +172,9 @@ class ROLT(nn.Module):
             action = self.action_embedding(observation.action)  # (B, D), eq. 2
             proprioception = torch.cat([legs, action[:, None]], dim=1)  # (B, L+1, D), eq. 3
 
-        B, (rows, columns), s = len(legs), SCAN_SHAPE, self.config.patch
+        B, (rows, columns), s = len(legs), SCAN_SHAPE, PATCH
         patches = observation.heights.reshape(B, rows // s, s, columns // s, s).transpose(2, 3)  # (B, 4, 3, s, s)
-        patches = self.patch_embedding(patches.reshape(B, self.num_patches, s * s))  # (B, P, D)
+        patches = self.patch_embedding(patches.reshape(B, NUM_PATCHES, s * s))  # (B, P, D)
         position = self.patch_position
         if "patch_position" in masks:
             keep = masks["patch_position"].bool()[:, :, None]
@@ -186,7 +184,7 @@ class ROLT(nn.Module):
     def _queries(self, layer: int) -> int:
         """How many tokens a layer updates: all that the next one reads; after the last only the legs are read."""
         last = layer == self.config.layers - 1
-        return self.num_legs if last else self.num_proprioceptive + self.num_patches
+        return self.num_legs if last else self.num_proprioceptive + NUM_PATCHES
 
     def _encode(self, observation: Observation, masks: Masks | None) -> tuple[Tensor, list[Tensor]]:
         x, masks, attention = self.tokens(observation, masks), masks or {}, []

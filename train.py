@@ -1,7 +1,7 @@
 """Trains a policy: PPO on every core, or on a GPU.
 
     python train.py --robot a1                            # ROLT on the stiffness task, about 95 minutes on two cores
-    python train.py --robot a1 --steps 20000              # does it run? a minute
+    python train.py --robot a1 --steps 20000 --out runs/try    # does it run? a minute
     python train.py --robot a1 --resume                   # goes on where it was stopped (Ctrl-C is safe)
     python train.py --robot a1 --task terrain --init runs/a1-stiffness-rolt-seed0/checkpoint.pt    # stairs, after flat ground
     python train.py --robot a1 --policy all               # every method of the paper in turn; skips what is finished
@@ -36,20 +36,19 @@ import torch.distributed as dist
 from torch import nn
 
 import checkpoint
-from baselines import METHODS, Stage, make_policy, training_stages
+from baselines import METHODS, STAGED, Stage, make_policy, training_stages
 from checkpoint import CheckpointError
 from cli import Parser, count, fail, lock_folder, num_cores, positive, seed, threads, writable_folder
 from env import CONTROL_DT, EnvConfig, LocomotionEnv
-from faults import TASKS
+from faults import TASKS, first_task
 from plots import learning_curve
 from ppo import Critic, Learner, PPOConfig, RolloutBuffer, all_reduce, collect
 from processes import orphaned, run
 from rewards import REWARDS
 from robots import ROBOTS
 
-# What a run may not change when it is resumed; of rma and roam, whose stages are shares of them, the steps neither.
+# What a run may not change when it is resumed; with several stages, which are shares of them, the steps neither.
 IDENTITY = ("robot", "task", "policy", "envs", "epochs", "minibatches", "seed", "processes", "device", "init")
-STAGED = ("rma", "roam")
 EPISODES = ("episodes", "returns", "lengths", "falls")  # figures of finished episodes, added up over a rollout
 
 
@@ -75,7 +74,7 @@ def parse_arguments(argv: list[str] | None = None):
     if args.paper:  # what is said beside it still counts
         parser.set_defaults(envs=4096, steps=400_000_000, epochs=5, minibatches=4)
         args = parser.parse_args(argv)
-    args.task = args.task or next(name for name, task in TASKS.items() if args.robot in task.robots)
+    args.task = args.task or first_task(args.robot)
     if args.robot not in TASKS[args.task].robots:
         fail(f"the task {args.task} is for {', '.join(TASKS[args.task].robots)}, not for {args.robot}")
     if args.device == "cuda" and not torch.cuda.is_available():
@@ -90,8 +89,8 @@ def parse_arguments(argv: list[str] | None = None):
     if args.policy == "all":
         if "RANK" in os.environ:
             fail("torchrun trains one policy at a time: name it instead of --policy all")
-        if args.out:
-            fail("every policy has a folder of its own: leave --out away with --policy all")
+        if args.out or args.init:
+            fail("every policy has a folder and a start of its own: leave --out and --init away with --policy all")
         return args
     args.out = args.out or Path("runs") / f"{args.robot}-{args.task}-{args.policy}-seed{args.seed}"
     saved = any(os.path.exists(args.out / name) for name in ("checkpoint.pt", "checkpoint.pt.previous"))
@@ -237,7 +236,6 @@ def train(rank: int, args, sync: str | None, stop: list) -> None:
             part = Part(place[2], stages[place[2]], args, rank, policy, device)
         part.learner.optimizer.step()  # with gradients that are still 0: moves nothing, but makes the state that is compared
         own = state()
-        saved = {"recent": own["recent"], "torch": own["torch"]} | saved  # files of before had neither
         for key in own:
             if key != "identity" and (why := checkpoint.misfit(saved.get(key), own[key], key)):
                 raise CheckpointError(f"the checkpoint in {args.out} does not fit this run: {why}")

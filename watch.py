@@ -27,7 +27,7 @@ import torch
 from checkpoint import CheckpointError, load_policy
 from cli import Parser, fail, positive, seed, writable_folder
 from env import CONTROL_DT, LocomotionEnv
-from faults import REAL_WORLD, TASKS, Fault, healthy, parse, props, write_fault
+from faults import REAL_WORLD, TASKS, Fault, first_task, healthy, parse, props, write_fault
 from noise import ScanNoise
 from noise import parse as parse_noise
 from ppo import to_tensors
@@ -48,7 +48,7 @@ class Show:
     ):  # fmt: skip
         self.policy, self.robot, self.fault, self.speed, self.seed = policy, robot, fault, speed, seed
         self.terrain, self.noise = terrain, noise
-        task = next(task for task in TASKS.values() if robot in task.robots)
+        task = TASKS[first_task(robot)]
         self.menu = [fault for _, fault in task.training] + list(task.unseen)
         self.menu += REAL_WORLD.values() if "go1" in task.robots else ()
         self.wishes, self.said, self.over = queue.Queue(), HELP, False
@@ -222,7 +222,7 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--video", type=Path, metavar="FILE.gif", help="write a moving picture instead")
     parser.add_argument("--seconds", type=positive, default=4.0, help="of the moving picture (default 4)")
     args = parser.parse_args(argv)
-    task = next(name for name, task in TASKS.items() if args.robot in task.robots) if args.stairs is None else "terrain"
+    task = first_task(args.robot) if args.stairs is None else "terrain"
     shipped = Path(os.path.relpath(Path(__file__).parent / "checkpoints")) / f"{args.robot}-{task}-rolt.pt"
     if args.video and args.video.suffix != ".gif":
         fail(f"--video is a .gif file, not {args.video}")
@@ -245,7 +245,7 @@ def main(argv: list[str] | None = None) -> None:
         desktop(show) if kind == "desktop" else browser(show, args.port)
     except KeyboardInterrupt:
         pass
-    except (CheckpointError, ValueError, RuntimeError, ImportError, OSError) as error:
+    except (CheckpointError, ValueError, RuntimeError, ImportError, OSError, FloatingPointError) as error:
         fail(error)
 
 

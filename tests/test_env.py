@@ -219,6 +219,18 @@ def test_friction_slows_a_sliding_robot():
     assert 2.0 - env._qvel[:, 1] == pytest.approx(friction * 9.81 * 3 * CONTROL_DT, rel=0.15)
 
 
+def test_the_length_of_an_episode_is_what_the_robot_has_lived():
+    """Also of the first one, which `random_ages` lets begin anywhere: an age is no length."""
+    env = LocomotionEnv("a1", 16, num_threads=1, config=EnvConfig(episode_seconds=10 * CONTROL_DT))
+    env.reset(random_ages=True)
+    left, lengths = 10 - env.age, {i: [] for i in range(16)}
+    for _ in range(20):
+        *_, truncated, info = env.step(np.zeros((16, 12)))
+        for i, length in zip(info["truncated_ids"], info["episode_lengths"], strict=True):  # nobody falls so soon
+            lengths[i].append(length)
+    assert len(set(left)) > 3 and all(lengths[i][:2] == [left[i], 10] for i in range(16))
+
+
 def test_a_robot_on_its_back_has_fallen_and_the_others_go_on():
     env = LocomotionEnv("a1", 3, num_threads=1)
     env.reset()

@@ -13,7 +13,7 @@ import checkpoint
 import evaluate
 import render
 from baselines import make_policy
-from faults import disable, healthy, lock
+from faults import disable, half_lock, healthy, lock, tow, weaken
 from gaits import duty_factor, feet_down, measure, stride_frequency, without_chatter
 from protocol import case_name
 from robots import ROBOTS
@@ -57,7 +57,10 @@ def test_a_gait_is_measured_after_the_start_or_not_at_all():
 
 
 def test_names_of_the_cases():
+    """The paper's words where it has one; the fault's own otherwise, so that no two faults share a name."""
     assert [case_name(fault) for fault in (healthy(), lock("FL_calf"), disable("ML_thigh"))] == ["healthy", "FL", "MLT"]
+    others = lock("FL_hip"), lock("FL_calf") + lock("RR_calf"), weaken("FL", 0.5), half_lock("RR_calf", -1.5), tow("RR")
+    assert [case_name(fault) for fault in others] == [str(fault) for fault in others]
 
 
 @pytest.mark.parametrize(
@@ -79,6 +82,24 @@ def test_gaits_of_every_fault(robot, task, cases, methods, tmp_path, monkeypatch
     assert len(rows) == len(methods) * cases * 2 * len(ROBOTS[robot].legs)
     assert {row["feet_down"] for row in rows} == {""} and {row["seconds"] for row in rows} == {"0.20"}  # too short
     assert (tmp_path / f"gaits-{robot}.png").stat().st_size > 1000
+
+
+def test_the_rows_hold_the_gait_of_their_leg_and_episode(tmp_path, monkeypatch):
+    """A stand-in walks with the contacts of TROT for 4.8 s (3.6 in episode 1 of the second case); 2 s on they count."""
+    contacts = np.tile(TROT, (20, 1))  # (240, 4)
+    walk = SimpleNamespace(contacts=np.stack([contacts] * 10, axis=1), steps=[240, 240, 240, 180] + [240] * 6, poses=contacts)
+    monkeypatch.setattr("render.record", lambda *arguments: walk)
+    monkeypatch.setattr("render.problem", lambda: "no frames here")
+    content = {"robot": "a1", "task": "stiffness", "steps": 0, "seed": 0, "policy": "mlp"}
+    checkpoint.save(content | {"weights": make_policy("mlp", ROBOTS["a1"]).state_dict()}, tmp_path / "policy.pt")
+    evaluate.main(["gaits", "--checkpoints", str(tmp_path / "policy.pt"), "--episodes", "2", "--out", str(tmp_path)])
+    with open(tmp_path / "gaits-a1.csv", newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [(row["case"], row["episode"], row["leg"]) for row in rows[11:14]] == [("FR", "0", "RL"), ("FR", "1", "FR"), ("FR", "1", "FL")]
+    assert [row["seconds"] for row in rows[11:14]] == ["4.80", "3.60", "3.60"]
+    assert [row["duty_factor"] for row in rows[:4]] == ["0.500", "0.500", "1.000", "0.000"]
+    assert [row["stride_hz"] for row in rows[:4]] == ["12.500", "12.500", "0.000", "0.000"]
+    assert {row["feet_down"] for row in rows} == {"2.000"}
 
 
 @pytest.mark.parametrize("way, says", [("disable", "MUJOCO_GL is disable"), ("nonsense", "MUJOCO_GL is nonsense")])

@@ -8,19 +8,19 @@ import torch
 
 import protocol
 from env import CONTROL_DT, Observation
-from faults import healthy, lock
+from faults import healthy, lock, skate
 
 
 class Playback:
     """Robot i walks 0.1 (i + 1) m and earns 1 a step. Those with a locked leg fall in step 3, begin again at 0, and fall in
-    step 5 once more."""
+    step 5 once more; those that skate diverge in step 4."""
 
     def __init__(self, robot, num_envs, seed, threads, situations, config, extras, **options):
         self.config, self.num_envs, self.step_number = config, num_envs, 0
-        self.position = np.zeros((num_envs, 3))
+        self.position, self.divergences = np.zeros((num_envs, 3)), 0
 
     def pin_faults(self, faults):
-        self.locked = np.array([bool(fault.locked) for fault in faults])
+        self.locked, self.skating = np.array([(bool(fault.locked), bool(fault.skating)) for fault in faults]).T
 
     def reset(self):
         return Observation(*(np.zeros((self.num_envs, 1), np.float32) for _ in range(6)))
@@ -29,10 +29,12 @@ class Playback:
         self.step_number += 1
         before = self.position.copy()
         before[:, 0] += 0.1 * np.arange(1, self.num_envs + 1)
-        fallen = self.locked & (self.step_number in (3, 5))
+        diverged = self.skating & (self.step_number == 4)
+        fallen = self.locked & (self.step_number in (3, 5)) | diverged
+        before[diverged], self.divergences = 1e9, self.divergences + diverged.sum()
         self.position = np.where(fallen[:, None], 0.0, before)
-        info = {"position": before, "diverged": np.zeros(self.num_envs, bool)}
-        return self.reset(), np.ones(self.num_envs), fallen, np.zeros(self.num_envs, bool), info
+        info = {"position": before, "diverged": diverged}
+        return self.reset(), 1.0 - diverged, fallen, np.zeros(self.num_envs, bool), info
 
 
 @pytest.fixture
@@ -49,9 +51,16 @@ def test_an_episode_ends_with_the_first_fall(policy):
     assert outcome["episode_return"] == pytest.approx([10, 3])
 
 
+def test_a_simulation_that_diverges_ends_where_it_last_was_and_is_told(policy, capsys):
+    outcome = protocol.run_episodes(policy, "a1", [healthy(), skate("FR")], 0.75, 10 * CONTROL_DT)
+    assert outcome["distance_m"] == pytest.approx([10 * 0.1, 3 * 0.2]) and outcome["episode_return"] == pytest.approx([10, 3])
+    assert outcome["fall_time_s"] == pytest.approx([10 * CONTROL_DT, 4 * CONTROL_DT])
+    assert capsys.readouterr().err == "1 simulations diverged and count as falls\n"
+
+
 def test_rows_name_the_case_that_they_are_of(policy):
     args = SimpleNamespace(
-        policies={"a.pt": (policy, {"policy": "mlp", "task": "stiffness", "seed": 7})}, scenes={},
+        policies={"a.pt": (policy, {"policy": "mlp", "method": "mlp", "task": "stiffness", "seed": 7})}, scenes={},
         robot="a1", episodes=2, seconds=10 * CONTROL_DT, seed=0, threads=1,
     )  # fmt: skip
     rows = protocol.run_cases(args, {"healthy": healthy(), "FR": lock("FR_calf")}, 0.75)

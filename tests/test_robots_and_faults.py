@@ -1,11 +1,13 @@
 """The model against its data sheet, and faults on simulated robots."""
 
+from dataclasses import fields
+
 import mujoco
 import numpy as np
 import pytest
 
 from env import CONTROL_DT, EnvConfig, LocomotionEnv
-from faults import TASKS, Fault, disable, healthy, lock, motor_strength, parse, weaken
+from faults import TASKS, Fault, disable, half_lock, healthy, lock, motor_strength, parse, skate, tow, weaken
 from robots import A1, ROBOTS, build_model
 
 QUIET = EnvConfig(push_speed=0.0, start_speed=0.0, start_pose=(1.0, 1.0), friction=(1.0, 1.0))
@@ -156,6 +158,15 @@ def test_fault_names_read_back():
         assert parse(str(fault)) == fault
     assert motor_strength(lock("FR_calf") + weaken("RL", 0.5), A1).tolist() == [1, 1, 0] + [1] * 6 + [0.5] * 3
     assert healthy() == Fault()
+
+
+def test_every_field_of_a_fault_has_a_name_of_its_own():
+    """A field that `__str__` or `parse` forgets makes a fault that calls itself healthy in tables and checkpoints."""
+    one_each = lock("FR_calf"), weaken("FR", 0.5), half_lock("FR_calf", -1.0), tow("FR"), skate("FR")
+    for field in fields(Fault):
+        assert sum(bool(getattr(fault, field.name)) for fault in one_each) == 1, f"an example with {field.name} is missing above"
+    assert len({str(fault) for fault in one_each}) == len(fields(Fault)) and "healthy" not in map(str, one_each)
+    assert [parse(str(fault)) for fault in one_each] == list(one_each)
 
 
 @pytest.mark.parametrize("text", ["", "lock", "lock:", "weaken:RL", "weaken:RL:x", "weaken:RL:2", "weaken:RL:nan", "melt:FR"])

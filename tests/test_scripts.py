@@ -14,6 +14,8 @@ import cli
 import evaluate
 import train
 from baselines import METHODS, make_policy
+from faults import healthy
+from noise import ScanNoise
 from plots import learning_curve
 from robots import A1, ROBOTS
 
@@ -159,6 +161,40 @@ def test_noise_tests_and_attention_on_stairs(tmp_path, capsys):
     entropies = [float(line.split()[-1]) for line in capsys.readouterr().out.splitlines() if "entropy" in line]
     assert len(entropies) == 4 and min(entropies) > 0.95  # a gaze that has learned nothing is even
     assert all((tmp_path / f"{name}.png").stat().st_size > 1000 for name in ("low_frequency", "high_frequency", "attention"))
+
+
+def test_tests_on_stairs_ask_for_their_ground_and_their_noise(tmp_path, monkeypatch):
+    asked = []
+
+    def record(args, cases, speed, terrain, noise):
+        assert list(cases.values()) == [healthy()] and speed == 0.5 and terrain.columns == ("stairs",)
+        asked.append((*cases, *set(terrain.levels), noise))
+        figures = {"distance_m": "1", "fall_time_s": "1", "episode_return": "1"}
+        return [{"method": "rolt", "case": case, "episode": 0} | figures for case in cases]
+
+    monkeypatch.setattr("evaluate.run_cases", record)
+    card = {"robot": "a1", "task": "terrain", "policy": "rolt", "steps": 0, "seed": 0}
+    checkpoint.save(card | {"weights": make_policy("rolt", A1).state_dict()}, tmp_path / "policy.pt")
+    for name in ("stairs", "low_frequency", "high_frequency"):
+        evaluate.main([name, "--checkpoints", str(tmp_path / "policy.pt"), "--out", str(tmp_path)])
+
+    heights = dict(zip(("1.4 cm", "3.2 cm", "5.0 cm", "6.8 cm", "8.6 cm", "10.4 cm", "12.2 cm"), range(-2, 5)))
+    expected = [(case, level, ScanNoise()) for case, level in heights.items()]
+    expected += [(f"{case} blind", level, ScanNoise(missing_patches=12)) for case, level in heights.items()]
+    for kind in ("offset", "sigma"):
+        expected += [(f"{scale:g}", 0, ScanNoise(**{kind: scale})) for scale in (0.0, 0.05, 0.1, 0.2, 0.4, 0.8, 1.6)]
+    assert asked == expected
+
+
+def test_two_variants_of_a_method_are_not_taken_for_one(tmp_path):
+    card = {"robot": "a1", "task": "stiffness", "policy": "mlp", "steps": 0, "seed": 0}
+    files = [tmp_path / "one.pt", tmp_path / "two" / "policy.pt", tmp_path / "other-seed.pt"]
+    files[1].parent.mkdir()
+    for file, seed in zip(files, (0, 0, 1)):
+        checkpoint.save(card | {"seed": seed, "weights": make_policy("mlp", A1).state_dict()}, file)
+    quick = ["--episodes", "1", "--seconds", "0.1", "--threads", "1", "--out", str(tmp_path)]
+    evaluate.main(["stiffness", "--checkpoints", *map(str, files), *quick])
+    assert [row["method"] for row in rows(tmp_path / "stiffness.csv")][::5] == ["mlp (one)", "mlp (two)", "mlp"]
 
 
 def test_damage_test_stands_beside_the_papers(tmp_path, capsys):

@@ -13,6 +13,10 @@ import torch
 import checkpoint
 import processes
 import train
+from baselines import make_policy
+from env import LocomotionEnv
+from ppo import Critic
+from robots import A1
 
 COMMON = ["--policy", "mlp", "--threads", "1", "--envs", "8", "--minibatches", "2"]
 
@@ -71,9 +75,19 @@ def test_a_checkpoint_that_does_not_fit_is_refused_by_name(path_and_value, says,
 
 
 def test_a_constant_that_an_older_run_did_not_know_is_no_contradiction(trained, tmp_path):
-    older = changed(changed(trained[1], "identity", "PPOConfig.clip", ...), "recent", ...)
-    resume(trained, older, tmp_path)
+    resume(trained, changed(trained[1], "identity", "PPOConfig.clip", ...), tmp_path)
     assert checkpoint.load(tmp_path / "checkpoint.pt")["iteration"] == 2
+
+
+def test_a_start_from_a_file_takes_its_weights_and_measures_anew(trained):
+    """The policy, the critic, and what their normalizer measured, until the first rollout replaces it."""
+    content, policy = trained[1], make_policy("mlp", A1)
+    critic = Critic(LocomotionEnv("a1", 1).reset(), policy.normalizer)
+    checkpoint.start_from(trained[0] / "checkpoint.pt", policy, critic)
+    for module, key in ((policy, "weights"), (critic, "critic")):
+        for name, tensor in module.state_dict().items():
+            assert torch.equal(tensor, content[key][name]) != name.endswith("count"), name
+    assert policy.normalizer.count == 0 < content["weights"]["normalizer.count"]
 
 
 @pytest.mark.parametrize(
