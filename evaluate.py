@@ -149,7 +149,7 @@ def real_world(args) -> None:
     """Section IV-C, table "Real-world Experiments", rebuilt in simulation: a Go1 trained on the stiffness task, 10 s.
 
         weaken   the front left leg's motors at half their strength, the hind right calf tied so that it cannot open
-                 beyond its default angle
+                 beyond its default angle; then each other leg weak in its place
         box      the hind right foot drags a box of 4 kg (20 N) on a tether of 0.8 m
         skates   both front feet are wheels
 

@@ -240,9 +240,12 @@ def first_task(robot: str) -> str:
 # Section IV-C: "we weaken the motor strength of one leg and lock the hind back leg with a string", "pull a box with one
 # single hind right leg", "two roller skates are tied to the robot's front feet". The paper gives no numbers. Ours: half the
 # strength; of the front leg that training never harmed, and of the hind leg that tows, so that both are new; the string at
-# the default angle, where training locks.
+# the default angle, where training locks. Which leg is weak decides who falls, so the other three are tested as well.
 REAL_WORLD = {
     "weaken": weaken("FL", 0.5) + half_lock("RR_calf", -1.5),
+    "weaken FR": weaken("FR", 0.5) + half_lock("RR_calf", -1.5),
+    "weaken RR": weaken("RR", 0.5) + half_lock("RL_calf", -1.5),
+    "weaken RL": weaken("RL", 0.5) + half_lock("RR_calf", -1.5),
     "box": tow("RR"),
     "skates": skate("FR") + skate("FL"),
 }
