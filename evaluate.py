@@ -12,7 +12,8 @@
     python evaluate.py watch --robot a1 --fault lock:FR_calf     # a viewer; see watch.py, or watch --help
 
 Each prints a table and writes EXPERIMENT.csv (one row an episode) and EXPERIMENT.png to --out (default: results).
-Policies act by their mean, without dropout (ROAM draws which of its behaviours acts). The same seed and the same number of threads give the same numbers.
+Policies act by their mean, without dropout (ROAM draws which of its behaviours acts). The same seed and the same number of
+threads give the same numbers.
 """
 
 import os
@@ -44,7 +45,7 @@ from scandots import HEIGHT_SCALE, NUM_PATCHES, as_patches
 from terrain import Terrain, rise
 
 STAIRS_LEVEL = 0  # of the noise tests, ours: steps of 5 cm, the easiest of legged_gym
-NOISE_SCALES = (0.0, 0.05, 0.1, 0.2, 0.4, 0.8, 1.6)  # m, ours: up to where half of the points read what heights are clipped to
+NOISE_SCALES = (0.0, 0.05, 0.1, 0.2, 0.4, 0.8, 1.6)  # m, ours: in the end half of the points read the clip
 
 
 def stiffness(args) -> None:

@@ -116,8 +116,8 @@ def report_curves(args, rows: list[dict], scales: tuple[float, ...], name: str, 
     print_falls(args, rows, cases, labels)
     print(f"\ndistance at {labels[-1]}, of the clean one")
     for method, (mean, _) in panels["distance walked [m]"].items():
-        share = f"{mean[-1] / mean[0]:>14.0%}" if mean[0] > 2 else "  hardly walks with clean heights either"  # 2 m
-        print(f"{method:28}{share}")
+        climbs = mean[0] > 2  # m, most of the six steps
+        print(f"{method:28}" + (f"{mean[-1] / mean[0]:>14.0%}" if climbs else "  hardly climbs with clean heights either"))
     curves(panels, scales, args.out / f"{name}.png", title, axis)
     print(f"\nwritten: {args.out / f'{name}.csv'}, {args.out / f'{name}.png'}")
 
@@ -151,7 +151,10 @@ def print_falls(args, rows: list[dict], cases: list[str], labels: list[str]) -> 
 
 
 def print_choices(picked: torch.Tensor, behaviours: list[str], cases: list[str]) -> None:
-    """Of ROAM: the share of each behaviour (K of them) in all steps of a case, after falls too. picked: (cases * episodes, K) steps."""
+    """Of ROAM: the share of each behaviour (K of them) in all steps of a case, after falls too.
+
+    picked: (cases * episodes, K) steps.
+    """
     shares = picked.unflatten(0, (len(cases), -1)).sum(1)  # (cases, K)
     shares /= shares.sum(1, keepdim=True)
     print(f"\n{'roam chooses':28}" + "".join(f"{case:>{column_width(cases)}}" for case in cases))
