@@ -325,8 +325,6 @@ METHODS = {
     "no-feature-drop": partial(ROLT, config=ROLTConfig(feature_dropout=0.0)),
     "rolt": ROLT,
 }
-
-
 STAGED = tuple(name for name, method in METHODS.items() if hasattr(method, "stages"))  # trained in more than one way
 
 

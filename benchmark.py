@@ -42,7 +42,6 @@ try:
 except ImportError:  # Windows
     resource = None
 
-
 ONE_STAGE = tuple(name for name in METHODS if name not in STAGED)  # what one critic and one learner train
 
 

@@ -56,7 +56,7 @@ def run_episodes(
         if not upright.any():
             break
     if env.divergences:
-        print(f"{env.divergences} simulations diverged and count as falls", file=sys.stderr)
+        print(f"simulations that diverged, counted as falls: {env.divergences}", file=sys.stderr)
     return {"distance_m": distance, "fall_time_s": fall_time, "episode_return": returns}
 
 

@@ -49,11 +49,16 @@ class ROLTConfig:
 
 
 def draw_mask(shape: tuple[int, ...], p: float, generator: torch.Generator) -> Tensor:
-    """Bools, False with probability p to within 1e-5. A 64-bit random number makes four decisions of 16 bits each: a third
-    of the time of torch.rand, and ROLT on four legs needs 6,732 decisions a robot and step."""
-    numbers = torch.empty(math.ceil(math.prod(shape) / 4), dtype=torch.int64, device=generator.device)
+    """Bools of this shape, False with probability p to within 1e-5 (too coarse for Roll-Drop's rate of 1e-4).
+
+    A 64-bit random number makes four decisions of 16 bits each: a third of the time of torch.rand, and ROLT on four legs
+    needs 6,732 decisions a robot and step.
+    """
+    size = math.prod(shape)
+    numbers = torch.empty(math.ceil(size / 4), dtype=torch.int64, device=generator.device)
     numbers.random_(-(2**63), None, generator=generator)  # all 64 bits
-    return (numbers.view(torch.int16)[: math.prod(shape)] >= round(p * 2**16) - 2**15).view(shape)
+    decisions = numbers.view(torch.int16)[:size]  # (size,) uniform from -2^15 to 2^15 - 1
+    return (decisions >= round(p * 2**16) - 2**15).view(shape)
 
 
 def drop(x: Tensor, keep: Tensor | None, p: float) -> Tensor:

@@ -55,7 +55,7 @@ def test_a_simulation_that_diverges_ends_where_it_last_was_and_is_told(policy, c
     outcome = protocol.run_episodes(policy, "a1", [healthy(), skate("FR")], 0.75, 10 * CONTROL_DT)
     assert outcome["distance_m"] == pytest.approx([10 * 0.1, 3 * 0.2]) and outcome["episode_return"] == pytest.approx([10, 3])
     assert outcome["fall_time_s"] == pytest.approx([10 * CONTROL_DT, 4 * CONTROL_DT])
-    assert capsys.readouterr().err == "1 simulations diverged and count as falls\n"
+    assert capsys.readouterr().err == "simulations that diverged, counted as falls: 1\n"
 
 
 def test_rows_name_the_case_that_they_are_of(policy):
