@@ -74,7 +74,10 @@ def parse_arguments(argv: list[str] | None = None):
     if args.paper:  # what is said beside it still counts
         parser.set_defaults(envs=4096, steps=400_000_000, epochs=5, minibatches=4)
         args = parser.parse_args(argv)
-    args.task = args.task or first_task(args.robot)
+    try:
+        args.task = args.task or first_task(args.robot)
+    except ValueError as error:
+        fail(error)
     if args.robot not in TASKS[args.task].robots:
         fail(f"the task {args.task} is for {', '.join(TASKS[args.task].robots)}, not for {args.robot}")
     if args.device == "cuda" and not torch.cuda.is_available():

@@ -222,12 +222,12 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--video", type=Path, metavar="FILE.gif", help="write a moving picture instead")
     parser.add_argument("--seconds", type=positive, default=4.0, help="of the moving picture (default 4)")
     args = parser.parse_args(argv)
-    task = first_task(args.robot) if args.stairs is None else "terrain"
-    shipped = Path(os.path.relpath(Path(__file__).parent / "checkpoints")) / f"{args.robot}-{task}-rolt.pt"
     if args.video and args.video.suffix != ".gif":
         fail(f"--video is a .gif file, not {args.video}")
     torch.set_num_threads(1)
     try:
+        task = first_task(args.robot) if args.stairs is None else "terrain"
+        shipped = Path(os.path.relpath(Path(__file__).parent / "checkpoints")) / f"{args.robot}-{task}-rolt.pt"
         policy, _ = load_policy(args.checkpoint or shipped, args.robot)
         fault, noise = parse(args.fault), parse_noise(args.noise)
         terrain = None if args.stairs is None else Terrain(("stairs",), (args.stairs,) * 9)

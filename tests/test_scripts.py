@@ -13,6 +13,7 @@ import checkpoint
 import cli
 import evaluate
 import train
+import watch
 from baselines import METHODS, make_policy
 from faults import healthy
 from noise import ScanNoise
@@ -266,6 +267,15 @@ def test_wrong_input_ends_in_one_line(words, says, tmp_path, capsys, monkeypatch
     error = capsys.readouterr().err
     assert error.count("\n") == 1 and error.startswith("error: ") and re.search(says, error)
     assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_a_robot_that_no_task_names_is_told_where_to_be_named(monkeypatch, capsys):
+    monkeypatch.setitem(ROBOTS, "new", A1)
+    for script in (train, watch):
+        with pytest.raises(SystemExit) as ended:
+            script.main(["--robot", "new"])
+        error = capsys.readouterr().err
+        assert ended.value.code == 2 and error.count("\n") == 1 and "name it in one of TASKS" in error
 
 
 def test_a_failed_save_keeps_the_former_file(tmp_path, monkeypatch):
