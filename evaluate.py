@@ -11,7 +11,9 @@
 
     python evaluate.py watch --robot a1 --fault lock:FR_calf     # a viewer; see watch.py, or watch --help
 
-Each prints a table and writes EXPERIMENT.csv (one row an episode) and EXPERIMENT.png to --out (default: results).
+Each prints a table and writes EXPERIMENT.csv and EXPERIMENT.png to --out (default: results); one row an episode, and in
+gaits-ROBOT.csv an episode and leg, in attention.csv a policy and scan, in dropout_ratio.csv a rate and scheme. Several seeds
+of a method are put together, and shown one by one below.
 Policies act by their mean, without dropout (ROAM draws which of its behaviours acts). The same seed and the same number of
 threads give the same numbers.
 """
@@ -132,23 +134,27 @@ def attention(args) -> None:
         if fallen.any():
             fail("the policy that walks falls within 4 s: another --seed starts it differently")
     missing = missing_points(ScanNoise(missing_patches=4), 1, np.random.default_rng(args.seed))
-    patches, panels = as_patches(missing[0]).any(axis=1), {}
+    patches, panels, rows = as_patches(missing[0]).any(axis=1), {}, []
     for title, heights in (("clean", observation.heights), ("4 patches missing", np.where(missing, 0, observation.heights))):
         panels[title] = {"heights": heights[0] / HEIGHT_SCALE}
-        for policy, card in args.policies.values():
+        for path, (policy, card) in args.policies.items():
             weights = policy.attention(to_tensors(observation._replace(heights=heights.astype(np.float32)), "cpu"))
             weights = weights[0, -1, :, :, -NUM_PATCHES:].mean((0, 1)).numpy()
             weights /= weights.sum()
             entropy = -(weights * np.log(weights)).sum() / np.log(NUM_PATCHES)
-            print(f"{card['method']:16}{title:20} on the 4 patches {weights[patches].sum():6.1%}, entropy {entropy:.3f}")
-            panels[title][card["method"]] = weights
+            share, panels[title][card["method"]] = weights[patches].sum(), weights
+            rows.append({"method": card["method"], "checkpoint": str(path), "seed": card["seed"], "scan": title})
+            rows[-1] |= {"share_of_4_patches": f"{share:.4f}", "entropy": f"{entropy:.4f}"}
+            print(f"{card['method']:16}{title:20} on the 4 patches {share:6.1%}, entropy {entropy:.3f}")
+    write_csv(args.out / "attention.csv", rows)
     attention_maps(panels, args.out / "attention.png")
-    print(f"\nwritten: {args.out / 'attention.png'}")
+    print(f"\nwritten: {args.out / 'attention.csv'}, {args.out / 'attention.png'}")
 
 
 def real_world(args) -> None:
     """Section IV-C, table "Real-world Experiments", rebuilt in simulation: a Go1 trained on the stiffness task, 10 s.
 
+        healthy  for comparison, not in the paper's table
         weaken   the front left leg's motors at half their strength, the hind right calf tied so that it cannot open
                  beyond its default angle; then each other leg weak in its place
         box      the hind right foot drags a box of 4 kg (20 N) on a tether of 0.8 m
@@ -223,6 +229,7 @@ EXPERIMENTS = {
     "gaits": (gaits, None, tuple(METHODS)),  # any task that the robot has
     "dropout_ratio": (dropout_ratio, "stiffness", ("rolt",)),
 }
+PICTURES = ("attention", "gaits", "dropout_ratio")  # of one policy a method
 DEFAULTS = {  # where they are not the task's first robot, the paper's 20 s and all methods
     "real_world": {"robot": "go1", "seconds": 10.0},
     "gaits": {"seconds": 10.0, "methods": ("rolt", "mlp")},
@@ -230,15 +237,17 @@ DEFAULTS = {  # where they are not the task's first robot, the paper's 20 s and 
 
 
 def find_policies(args) -> dict[Path, tuple]:
-    """{path: (policy, card)}: the files of --checkpoints, or what checkpoints/ holds for this test."""
+    """{path: (policy, card)}: the files of --checkpoints, or what checkpoints/ holds for this test: a file a method, and where
+    the test is a table of numbers the method's other seeds, too (ROBOT-TASK-METHOD-seedN.pt)."""
     if args.checkpoints:
         paths = args.checkpoints
     else:
         task, wanted = args.task, args.methods or EXPERIMENTS[args.experiment][2]
-        shipped = Path(os.path.relpath(Path(__file__).parent / "checkpoints"))
+        shipped, others = Path(os.path.relpath(Path(__file__).parent / "checkpoints")), args.experiment not in PICTURES
         named = {method: shipped / f"{args.robot}-{task}-{method}.pt" for method in wanted}
-        paths = [path for path in named.values() if path.is_file()]
         missing = [method for method, path in named.items() if not path.is_file()]
+        found = [path for method, path in named.items() if method not in missing]
+        paths = [p for path in found for p in (path, *sorted(shipped.glob(f"{path.stem}-seed*.pt")) * others)]
         if missing:
             train = f"python train.py --robot {args.robot} --task {task} --policy {missing[0]}"
             train += " --init FILE, a policy that walks on flat ground" * bool(TASKS[task].terrain)
@@ -259,8 +268,8 @@ def find_policies(args) -> dict[Path, tuple]:
 
 def rolt_or_last(args) -> torch.nn.Module:
     """The policy to be watched."""
-    policies = {card["policy"]: policy for policy, card in args.policies.values()}
-    return policies.get("rolt", list(policies.values())[-1])
+    policies = [policy for policy, _ in args.policies.values()]
+    return next((policy for policy, card in args.policies.values() if card["policy"] == "rolt"), policies[-1])
 
 
 def video(args) -> None:
@@ -291,6 +300,8 @@ def main(argv: list[str] | None = None) -> None:
     args.scenes = {}  # {case: (fault, speed, options of the env)}, for the film
     if args.video and (args.video.suffix != ".gif" or args.experiment == "dropout_ratio"):
         fail("--video is a .gif file, and for tests in which a robot walks (all but dropout_ratio)")
+    if args.methods and args.checkpoints:
+        fail("--methods chooses among the shipped checkpoints, --checkpoints names files: leave one of them away")
     function, task, suitable = EXPERIMENTS[args.experiment]
     robots = tuple(dict.fromkeys(robot for name in ([task] if task else TASKS) for robot in TASKS[name].robots))
     defaults = DEFAULTS.get(args.experiment, {})
@@ -308,7 +319,7 @@ def main(argv: list[str] | None = None) -> None:
         fail(f"{args.experiment} is for {', '.join(suitable)}, not for {', '.join(sorted(unsuitable))}")
     writable_folder(args.out)
     if args.video:
-        writable_folder(args.video.parent)
+        writable_folder(args.video.parent, "--video")
     torch.set_num_threads(args.threads)
     try:
         function(args)

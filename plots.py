@@ -131,8 +131,9 @@ def attention_maps(panels: dict[str, dict[str, np.ndarray]], picture: Path) -> N
             limits = {} if heights else {"vmin": 0, "vmax": max(0.25, values.max())}
             image = axis.imshow(grid[::-1, ::-1], cmap="viridis" if heights else "magma", **limits)
             draw_patches(axis, grid.shape, PATCH if heights else 1)
-            axis.set_title(f"{situation}: {'heights [m]' if heights else name}", fontsize=9)
+            axis.set_title(f"{situation}: {'scandots [m]' if heights else name}", fontsize=9)
             figure.colorbar(image, ax=axis, shrink=0.7)
+    figure.suptitle("Scandots (trunk height - 0.5 m - ground), and the attention on their patches; forward is up", fontsize=9)
     save_figure(figure, picture)
 
 

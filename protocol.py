@@ -129,12 +129,21 @@ def methods_of(rows: list[dict]) -> list[str]:
 def print_table(
     rows: list[dict], cases: list[str], labels: list[str], column: str, quantity: str, paper: dict = {}
 ) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """Prints and returns {method: (means, standard deviations)}, one number a case; paper: {method: {case: (mean, sd)}}."""
+    """Prints and returns {method: (means, standard deviations)}, one number a case; prints the seeds of a method, too, if there
+    are several. paper: {method: {case: (mean, sd)}}."""
     table = {method: mean_and_deviation(rows, method, cases, column) for method in methods_of(rows)}
     width = column_width(labels)
+
+    def show(name: str, means: np.ndarray, deviations: np.ndarray) -> None:
+        words = [f"{mean:.2f} ± {deviation:.2f}" for mean, deviation in zip(means, deviations)]
+        print(f"{name:28}" + "".join(f"{word:>{width}}" for word in words))
+
     print(f"\n{quantity:28}" + "".join(f"{label:>{width}}" for label in labels))
     for method, pairs in table.items():
-        print(f"{method:28}" + "".join(f"{f'{mean:.2f} ± {deviation:.2f}':>{width}}" for mean, deviation in zip(*pairs)))
+        show(method, *pairs)
+        seeds = list(dict.fromkeys(row["seed"] for row in rows if row["method"] == method))
+        for seed in seeds if len(seeds) > 1 else ():
+            show(f"  seed {seed}", *mean_and_deviation([row for row in rows if row["seed"] == seed], method, cases, column))
         if known := paper.get(method):
             words = ["{:.2f} ± {:.2f}".format(*known[case]) if case in known else "-" for case in cases]
             print(f"{'  (paper)':28}" + "".join(f"{word:>{width}}" for word in words))

@@ -68,6 +68,17 @@ def test_rows_name_the_case_that_they_are_of(policy):
     assert told == [("mlp", 7, "healthy", 0, 1.0), ("mlp", 7, "healthy", 1, 2.0), ("mlp", 7, "FR", 0, 0.9), ("mlp", 7, "FR", 1, 1.2)]
 
 
+def test_seeds_are_put_together_and_shown_one_by_one(capsys):
+    rows = [{"method": "rolt", "seed": i // 2, "case": "FR", "distance_m": f"{x}"} for i, x in enumerate((1, 3, 5, 7))]
+    rows += [{"method": "mlp", "seed": 0, "case": "FR", "distance_m": "2.0"}]
+    table = protocol.print_table(rows, ["FR"], ["FR"], "distance_m", "distance")
+    assert table["rolt"] == (pytest.approx([4.0]), pytest.approx([5**0.5])) and table["mlp"][0] == [2.0]
+    lines = [line.split() for line in capsys.readouterr().out.splitlines()]
+    assert ["rolt", "4.00", "±", "2.24"] in lines and ["mlp", "2.00", "±", "0.00"] in lines
+    assert ["seed", "0", "2.00", "±", "1.00"] in lines and ["seed", "1", "6.00", "±", "1.00"] in lines
+    assert sum(line[:1] == ["seed"] for line in lines) == 2  # of a method with one seed there is nothing to add
+
+
 def test_the_command_is_straight_on():
     config = protocol.straight_ahead(0.75, 20.0)
     assert config.forward_speed == (0.75, 0.75) and config.heading == (0.0, 0.0) and config.push_speed == 0.0
