@@ -140,7 +140,7 @@ def load_policy(path: str | Path, robot: str | None = None) -> tuple[torch.nn.Mo
         what = f"{card['robot']}, {card['task']}, {card['policy']}"
         raise CheckpointError(f"{path} is of a robot, task or policy unknown here: {what}")
     if robot is not None and card["robot"] != robot:
-        raise CheckpointError(f"{path} was trained on the {card['robot']}, not on the {robot}")
+        raise CheckpointError(f"{path} was trained on the {card['robot']}, not on the {robot}: say so with --robot")
     policy, weights = make_policy(card["policy"], ROBOTS[card["robot"]], TASKS[card["task"]]), content["weights"]
     if isinstance(weights, dict):
         weights = {name: x.float() if getattr(x, "dtype", None) == torch.half else x for name, x in weights.items()}

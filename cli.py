@@ -66,6 +66,13 @@ def positive(text: str, most: float = 1e6) -> float:
     return value
 
 
+def port(text: str) -> int:
+    """A whole number from 0 to 65535."""
+    if not text.isdecimal() or int(text) > 65535:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a port, a whole number from 0 to 65535")
+    return int(text)
+
+
 def num_cores() -> int:
     """Cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
@@ -86,11 +93,11 @@ def lock_folder(path: Path):
     return file
 
 
-def writable_folder(path: Path) -> Path:
-    """Makes the folder if need be; ends the program if nothing can be written there."""
+def writable_folder(path: Path, option: str = "--out") -> Path:
+    """Makes the folder if need be; ends the program if nothing can be written there. option: what names it."""
     try:
         path.mkdir(parents=True, exist_ok=True)
         tempfile.TemporaryFile(dir=path).close()
     except OSError as error:
-        fail(f"cannot write to the folder {path}: {error.strerror}; choose another with --out")
+        fail(f"cannot write to the folder {path}: {error.strerror}; choose another with {option}")
     return path

@@ -24,7 +24,7 @@ import mujoco
 import numpy as np
 from mujoco.batch import Batch
 
-from robots import BOX_FRICTION, ROBOTS, TETHER, Robot
+from robots import BOX_FRICTION, ROBOTS, Robot, tether_length
 from terrain import TRAINING_MAP, Terrain
 
 
@@ -44,8 +44,8 @@ class Fault:
     def __str__(self) -> str:
         """The name that `parse` reads back, e.g. 'lock:FR_calf+weaken:RL:0.5'."""
         words = [f"lock:{joint}" for joint in self.locked]
-        words += [f"weaken:{part}:{share:g}" if share else f"disable:{part}" for part, share in self.strength]
-        words += [f"half-lock:{joint}:{angle:g}" for joint, angle in self.half_locked]
+        words += [f"weaken:{part}:{share}" if share else f"disable:{part}" for part, share in self.strength]
+        words += [f"half-lock:{joint}:{angle}" for joint, angle in self.half_locked]
         words += [f"tow:{leg}" for leg in self.towing] + [f"skate:{leg}" for leg in self.skating]
         return "+".join(words) or "healthy"
 
@@ -76,8 +76,8 @@ def weaken(part: str, strength: float) -> Fault:
 
 
 def half_lock(joint: str, angle: float) -> Fault:
-    """The joint cannot turn past `angle` [rad] upwards, and turns freely below: for a calf, a string that keeps it from
-    opening (real-world test)."""
+    """The joint cannot turn past `angle` [rad] upwards, and turns freely below: for a calf of the A1 or the Go1, a string that
+    keeps it from opening (real-world test). Left legs of the hexapod turn the other way."""
     if not np.isfinite(angle):
         raise ValueError(f"an angle is a finite number, not {angle}")
     return Fault(half_locked=((joint, float(angle)),))
@@ -177,7 +177,7 @@ def write_fault(fault: Fault, robot: Robot, world: Batch, ids: np.ndarray) -> No
         for leg in fault.skating:
             loss[model.joint(f"{leg}_wheel").dofadr] = 0.0
         for leg in fault.towing:
-            reach[model.tendon(f"{leg}_tether").id, 1] = TETHER
+            reach[model.tendon(f"{leg}_tether").id, 1] = tether_length(robot, leg)
     except KeyError:
         raise ValueError(f"there is no box or wheel for {fault}: make the env with this fault among its faults") from None
     # nothing is written until all of it is known to be possible
@@ -242,6 +242,7 @@ def first_task(robot: str) -> str:
 # strength; of the front leg that training never harmed, and of the hind leg that tows, so that both are new; the string at
 # the default angle, where training locks. Which leg is weak decides who falls, so the other three are tested as well.
 REAL_WORLD = {
+    "healthy": healthy(),  # ours: what the others are to be compared with
     "weaken": weaken("FL", 0.5) + half_lock("RR_calf", -1.5),
     "weaken FR": weaken("FR", 0.5) + half_lock("RR_calf", -1.5),
     "weaken RR": weaken("RR", 0.5) + half_lock("RL_calf", -1.5),

@@ -64,7 +64,7 @@ def gaits(args) -> None:
     """The experiment: every fault of the robot's task, seen in training or not.
 
     Numbers of all episodes from 2 s on, in gaits-ROBOT.csv one row an episode and leg (empty if it fell before 3 s). The
-    picture shows the last 2 s of each case's first episode.
+    picture shows the last second of each case's first episode.
     """
     task, robot = TASKS[args.task], ROBOTS[args.robot]
     cases = {case_name(fault): fault for fault in (*(fault for _, fault in task.training), *task.unseen)}
@@ -112,15 +112,16 @@ def print_table(cases: list[str], legs: tuple[str, ...], measured: list[list[dic
         print(f"{case:10}{words}  {len(whole)} of {len(episodes)}")
 
 
-def panel(walk: render.Walk, robot: int, title: str, framed: bool, seconds: float = 2.0, num_frames: int = 7) -> dict:
-    """What `gait_diagrams` shows of one robot: its last `seconds`, with frames or without."""
+def panel(walk: render.Walk, robot: int, title: str, framed: bool, every: int = 7, num_frames: int = 7) -> dict:
+    """What `gait_diagrams` shows of one robot: its last second, and if `framed` a picture each `every` steps (0.14 s; of a stride
+    of 0.2 to 0.3 s the next one shows another phase)."""
     end = walk.steps[robot]
-    shown = np.arange(max(0, end - round(seconds / CONTROL_DT)), end)
-    every = -(-len(shown) // num_frames)
+    shown = np.arange(max(0, end - every * num_frames), end)
+    whole = max(every, len(shown) // every * every)  # a robot that fell early has fewer frames
     return {
         "title": title + ("" if end == len(walk.poses) else f", falls at {end * CONTROL_DT:.1f} s"),
         "time": shown * CONTROL_DT,
         "contacts": without_chatter(walk.contacts[:end, robot])[shown],
-        "frames": render.draw(walk, robot, shown[::every], 300, 220) if framed else [],
+        "frames": render.draw(walk, robot, shown[:whole:every], 300, 220) if framed else [],
         "frame_seconds": every * CONTROL_DT,
     }

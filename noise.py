@@ -37,6 +37,11 @@ class ScanNoise:
         if not (0 <= self.offset < np.inf and 0 <= self.sigma < np.inf):
             raise ValueError("the scale of noise is a number from 0 on")
 
+    def __str__(self) -> str:
+        """What `parse` reads back (but for `offset_patches` and `redraw`), e.g. 'offset:0.2+missing:4'."""
+        words = {"offset": self.offset, "missing": self.missing_patches, "sigma": self.sigma}
+        return "+".join(f"{name}:{value}" for name, value in words.items() if value) or "clean"
+
 
 def parse(text: str) -> ScanNoise:
     """Reads 'clean', 'offset:METRES', 'sigma:METRES', 'missing:PATCHES', or several joined with '+'.

@@ -129,7 +129,9 @@ def film(
     speed: float = 0.75, seed: int = 0, warm_up: float = 2.0, **env_options,
 ) -> list[np.ndarray]:  # fmt: skip
     """Frames of one robot that walks straight on, one each `every` control steps, after `warm_up` seconds. The film ends
-    where the robot falls."""
+    where the robot falls. ValueError if nothing is left of it."""
+    if seconds < CONTROL_DT:
+        raise ValueError(f"a film lasts at least {CONTROL_DT} s, not {seconds:g}")
     walk = record(policy, robot, [fault], warm_up + seconds, speed, seed, **env_options)
     steps = range(round(warm_up / CONTROL_DT), walk.steps[0], every)
     if not steps:
@@ -183,7 +185,7 @@ def write_strip(rows: dict[str, list[np.ndarray]], path: Path) -> None:
 def main(argv: list[str] | None = None) -> None:
     parser = Parser(__doc__)
     parser.add_argument("checkpoint", type=Path)
-    parser.add_argument("--fault", nargs="+", default=["healthy"], help="a row of the strip each; a GIF shows the first")
+    parser.add_argument("--fault", nargs="+", default=["healthy"], help="a row of the strip each; a GIF shows one")
     parser.add_argument("--seconds", type=partial(positive, most=120), help="default: 4 in a GIF, 0.6 in a strip")
     parser.add_argument("--speed", type=partial(positive, most=10), default=0.75, help="commanded, m/s")
     parser.add_argument("--seed", type=seed, default=0)
@@ -192,6 +194,8 @@ def main(argv: list[str] | None = None) -> None:
     args = parser.parse_args(argv)
     if args.out.suffix not in (".gif", ".png"):
         fail(f"--out is a .gif or a .png file, not {args.out}")
+    if args.out.suffix == ".gif" and len(args.fault) > 1:
+        fail("a .gif shows one fault; name a .png to see several in rows")
     try:
         policy, card = load_policy(args.checkpoint)
         faults = [parse(text) for text in args.fault]

@@ -30,8 +30,8 @@ PHYSICS_DT = 0.005  # s, legged_gym: 200 Hz physics, 4 substeps a control step o
 BOX_MASS = 4.0  # kg, a third of a Go1
 BOX_FRICTION = 0.5  # cardboard on a floor: 20 N to drag it, a sixth of a Go1's weight, on one leg
 BOX_SIZE = (0.3, 0.3, 0.2)  # m
-BOX_START = (-0.95, 0.0, 0.1)  # m, behind the robot: no hind leg's tether is taut at first
-TETHER = 0.8  # m
+BOX_START = (-0.95, 0.0, 0.1)  # m, behind the robot
+TETHER = 0.8  # m, of the hindmost legs: slack at first
 SLACK = 1000.0  # m, the length of a tether that nobody has tied
 WHEEL_MASS = 0.1  # kg
 BRAKE = 10.0  # N m, dry friction of a wheel that does not roll; on a foot of 0.02 m four times a robot's weight
@@ -165,6 +165,12 @@ def build_model(
         ctrl=np.ravel(robot.default_pose),
     )
     return spec.compile()
+
+
+def tether_length(robot: Robot, leg: str) -> float:
+    """m; a leg further forward has a tether that is longer by as much, or it would be taut before the robot walks."""
+    forward = [mount[0] for mount in robot.mounts]
+    return TETHER + forward[robot.legs.index(leg)] - min(forward)
 
 
 def _add_world(spec: mujoco.MjSpec) -> None:

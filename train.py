@@ -307,7 +307,7 @@ def train(rank: int, args, sync: str | None, stop: list) -> None:
         if steps < args.steps:
             print(f"\nstopped at {steps:,} steps and saved; the same command with --resume goes on")
         test = "stairs" if args.task == "terrain" else args.task
-        print(f"\ntrained: {policy_file}\ntest it: python evaluate.py {test} --checkpoints {policy_file}")
+        print(f"\ntrained: {policy_file}\ntest it: python evaluate.py {test} --robot {args.robot} --checkpoints {policy_file}")
     if args.processes > 1:
         dist.destroy_process_group()
 

@@ -14,9 +14,12 @@ falls starts over by itself.
 
 import os
 import queue
+import re
 import sys
 import threading
 import time
+import warnings
+from functools import partial
 from pathlib import Path
 
 import render  # first: it says how to draw without a display, which mujoco reads when it is imported
@@ -25,7 +28,7 @@ import numpy as np
 import torch
 
 from checkpoint import CheckpointError, load_policy
-from cli import Parser, fail, positive, seed, writable_folder
+from cli import Parser, fail, port, positive, seed, writable_folder
 from env import CONTROL_DT, LocomotionEnv
 from faults import REAL_WORLD, TASKS, Fault, first_task, healthy, parse, props, write_fault
 from noise import ScanNoise
@@ -35,6 +38,7 @@ from protocol import straight_ahead
 from robots import ROBOTS
 from terrain import Terrain
 
+MAX_COMMAND = 10.0  # m/s, ours: ten times what training commands
 HELP = "type a fault (lock:RL_calf, healthy, ...), a speed (0.5), noise (sigma:0.1, clean, ...), again or quit"
 
 
@@ -46,22 +50,22 @@ class Show:
         self, policy, robot: str, fault: Fault = healthy(), speed: float = 0.75, seed: int = 0,
         terrain: Terrain | None = None, noise: ScanNoise = ScanNoise(),
     ):  # fmt: skip
-        self.policy, self.robot, self.fault, self.speed, self.seed = policy, robot, fault, speed, seed
+        self.policy, self.robot, self.speed, self.seed = policy, robot, speed, seed
         self.terrain, self.noise = terrain, noise
         task = TASKS[first_task(robot)]
         self.menu = [fault for _, fault in task.training] + list(task.unseen)
-        self.menu += REAL_WORLD.values() if "go1" in task.robots else ()
+        self.menu += [fault for fault in REAL_WORLD.values() if "go1" in task.robots and fault not in self.menu]
         self.wishes, self.said, self.over = queue.Queue(), HELP, False
-        self.start()
+        self.start(fault)
 
-    def start(self) -> None:
-        """A new episode in a new env."""
+    def start(self, fault: Fault) -> None:
+        """A new episode in a new env. ValueError if the robot has no such part; then all stays as it was."""
         options = {"extras": self.policy.extras, "terrain": self.terrain, "noise": self.noise}
         options["config"] = straight_ahead(self.speed, 3600)
-        self.env = LocomotionEnv(self.robot, 1, self.seed, 1, [(1.0, self.fault)], **options)
-        self.observation = self.env.reset()
-        self.model = render.painted(self.env, self.fault)
-        self.data = mujoco.MjData(self.model)
+        env = LocomotionEnv(self.robot, 1, self.seed, 1, [(1.0, fault)], **options)
+        observation, model = env.reset(), render.painted(env, fault)
+        self.env, self.observation, self.fault = env, observation, fault
+        self.model, self.data = model, mujoco.MjData(model)
 
     def set_fault(self, fault: Fault) -> None:
         """Without a fall or a reset, unless a box or wheels come or go. ValueError if the robot has no such part."""
@@ -70,12 +74,7 @@ class Show:
             self.env.pin_faults([fault])  # at the next resets, too
             self.fault, self.model = fault, render.painted(self.env, fault)
         else:
-            before, self.fault = self.fault, fault
-            try:
-                self.start()
-            except ValueError:
-                self.fault = before
-                raise
+            self.start(fault)
 
     def obey(self, wish: str) -> None:
         """One of the words that HELP lists. What it cannot read changes nothing, and `said` tells why."""
@@ -83,15 +82,17 @@ class Show:
             if wish == "quit":
                 self.over = True
             elif wish == "again":
-                self.start()
+                self.start(self.fault)
             elif wish.replace(".", "", 1).isdecimal():
+                if float(wish) > MAX_COMMAND:
+                    raise ValueError(f"a speed is at most {MAX_COMMAND:g} m/s, not {wish}")
                 self.speed = float(wish)
-            elif wish.split(":")[0] in ("clean", "offset", "sigma", "missing"):
+            elif re.split("[:+]", wish)[0] in ("clean", "offset", "sigma", "missing"):
                 self.noise = parse_noise(wish)
                 self.env.scan.set_noise(self.noise)
             elif wish:
                 self.set_fault(parse(wish))
-            self.said = f"{self.fault}, {self.speed:g} m/s"
+            self.said = f"{self.fault}, {self.speed:g} m/s, scandots {self.noise}"
         except ValueError as error:
             self.said = str(error)
         print(self.said, flush=True)
@@ -128,7 +129,16 @@ def listen(show: Show) -> None:
 
 
 def has_display() -> bool:
-    return sys.platform != "linux" or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+    """Can a window be opened? On Linux, where mujoco.viewer would end the program if not, it is tried."""
+    if sys.platform != "linux":
+        return True
+    if not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+        return False
+    import glfw  # mujoco brings it along
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return bool(glfw.init())
 
 
 def desktop(show: Show) -> None:
@@ -159,8 +169,8 @@ def desktop(show: Show) -> None:
                 closed = not viewer.is_running()
 
 
-def browser(show: Show, port: int = 0) -> None:
-    """MuJoCo's viewer as a web page, with a panel of our own. `port` 0: the first free one from 8080 on."""
+def browser(show: Show, http_port: int = 0) -> None:
+    """MuJoCo's viewer as a web page, with a panel of our own. `http_port` 0: the first free one from 8080 on."""
     from mujoco.studio import launch_web, messages, plugin, viewer_protocol
     from mujoco.studio.dear_imgui import dear_imgui as imgui
 
@@ -195,7 +205,7 @@ def browser(show: Show, port: int = 0) -> None:
                     show.wishes.put("again")
             imgui.End()
 
-    config, clock = viewer_protocol.ViewerConfig(title=f"ROLT: {show.robot}", gfx="web", http_port=port), Clock()
+    config, clock = viewer_protocol.ViewerConfig(title=f"ROLT: {show.robot}", gfx="web", http_port=http_port), Clock()
     with launch_web.launch(config, plugins=[Panel()]) as handle:
         while handle.is_running() and not show.over:
             show.step()
@@ -213,14 +223,14 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--robot", default="a1", choices=ROBOTS)
     parser.add_argument("--checkpoint", type=Path, metavar="FILE", help="default: the shipped ROLT of the robot")
     parser.add_argument("--fault", default="healthy", help="e.g. lock:FR_calf+weaken:RL:0.5 (default healthy)")
-    parser.add_argument("--speed", type=positive, default=0.75, help="commanded, m/s (default 0.75)")
+    parser.add_argument("--speed", type=partial(positive, most=MAX_COMMAND), default=0.75, help="commanded, m/s (default 0.75)")
     parser.add_argument("--stairs", type=int, choices=range(-2, 11), metavar="LEVEL", help="-2 to 10, instead of flat ground")
     parser.add_argument("--noise", default="clean", help="on the scandots, e.g. offset:0.2, sigma:0.1, missing:4")
     parser.add_argument("--seed", type=seed, default=0)
     parser.add_argument("--viewer", choices=("desktop", "browser"), help="default: desktop where there is a display")
-    parser.add_argument("--port", type=int, default=0, help="of the browser viewer (default: the first free from 8080 on)")
+    parser.add_argument("--port", type=port, default=0, help="of the browser viewer (default: the first free from 8080 on)")
     parser.add_argument("--video", type=Path, metavar="FILE.gif", help="write a moving picture instead")
-    parser.add_argument("--seconds", type=positive, default=4.0, help="of the moving picture (default 4)")
+    parser.add_argument("--seconds", type=partial(positive, most=120), default=4.0, help="of the moving picture (default 4)")
     args = parser.parse_args(argv)
     if args.video and args.video.suffix != ".gif":
         fail(f"--video is a .gif file, not {args.video}")
@@ -232,16 +242,18 @@ def main(argv: list[str] | None = None) -> None:
         fault, noise = parse(args.fault), parse_noise(args.noise)
         terrain = None if args.stairs is None else Terrain(("stairs",), (args.stairs,) * 9)
         if args.video:
-            writable_folder(args.video.parent)
+            writable_folder(args.video.parent, "--video")
             options = {"speed": args.speed, "seed": args.seed, "terrain": terrain, "noise": noise}
             frames = render.film(policy, args.robot, fault, args.seconds, 2, **options)
             render.write_gif(frames, args.video, 2 * CONTROL_DT)
             print(f"written: {args.video}")
             return
+        kind = args.viewer or ("desktop" if has_display() else "browser")
+        if kind == "desktop" and not has_display():
+            fail("no window can be opened: set DISPLAY to a screen that is there, or use --viewer browser")
         show = Show(policy, args.robot, fault, args.speed, args.seed, terrain, noise)
         print(HELP)
         listen(show)
-        kind = args.viewer or ("desktop" if has_display() else "browser")
         desktop(show) if kind == "desktop" else browser(show, args.port)
     except KeyboardInterrupt:
         pass

@@ -86,6 +86,14 @@ def test_the_box_hangs_on_its_own_robot_alone():
     assert tether[0] == pytest.approx(TETHER, abs=0.02) and tether[1] > TETHER + 1
 
 
+@pytest.mark.parametrize("robot", ROBOTS)
+def test_no_tether_is_taut_before_the_robot_walks(robot):
+    faults = [tow(leg) for leg in ROBOTS[robot].legs] * 5
+    env = make(*faults, robot=robot, config=EnvConfig())
+    length, reach = env.world.bind("ten_length"), env.world.expanded("tendon_range")[:, :, 1]
+    assert (length < reach).all() and ((reach < SLACK).sum(axis=1) == 1).all()
+
+
 def test_a_half_lock_stops_one_side_only():
     """The calf asked to open by 0.5 rad stays at the string; asked to bend by 0.5 rad it goes like a healthy one."""
     for target, stopped in ((-1.0, True), (-2.0, False)):
@@ -149,7 +157,8 @@ def test_it_goes_on_to_the_bit_with_a_box_and_skates():
 
 
 def test_their_names_read_back():
-    for fault in (*REAL_WORLD.values(), lock("FR_calf") + weaken("RL", 0.5) + tow("RR") + skate("FL")):
+    thirds = weaken("FR", 1 / 3) + half_lock("RR_calf", -4 / 3)  # to the last digit
+    for fault in (*REAL_WORLD.values(), thirds, lock("FR_calf") + weaken("RL", 0.5) + tow("RR") + skate("FL")):
         assert parse(str(fault)) == fault
     assert str(REAL_WORLD["weaken"]) == "weaken:FL:0.5+half-lock:RR_calf:-1.5"
 
@@ -188,7 +197,7 @@ def test_the_real_world_test_stands_beside_the_papers(tmp_path, capsys):
     evaluate.main(["real_world", *policy, "--episodes", "2", "--seconds", "0.1"])
     with open(tmp_path / "real_world.csv", newline="") as file:
         rows = list(csv.DictReader(file))
-    assert [row["case"] for row in rows[::2]] == ["weaken", "weaken FR", "weaken RR", "weaken RL", "box", "skates"]
+    assert [row["case"] for row in rows[::2]] == ["healthy", "weaken", "weaken FR", "weaken RR", "weaken RL", "box", "skates"]
     columns = ("method", "checkpoint", "seed", "case", "episode", "distance_m", "fall_time_s", "episode_return")
     assert tuple(rows[0]) == columns
     said = capsys.readouterr().out

@@ -5,9 +5,12 @@ import signal
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
+import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 import checkpoint
 import cli
@@ -55,7 +58,7 @@ def test_train_resume_evaluate(tmp_path, capsys):
     train.main([*common, "--steps", "384", "--out", str(broken)])
     train.main([*common, "--steps", "576", "--out", str(broken), "--resume"])
     train.main([*common, "--steps", "576", "--out", str(whole)])
-    assert "test it: python evaluate.py stiffness" in capsys.readouterr().out
+    assert "test it: python evaluate.py stiffness --robot a1 --checkpoints" in capsys.readouterr().out
 
     progress = rows(broken / "progress.csv")
     assert [int(row["steps"]) for row in progress] == [192, 384, 576]
@@ -160,6 +163,8 @@ def test_noise_tests_and_attention_on_stairs(tmp_path, capsys):
         assert [row["case"] for row in rows(tmp_path / f"{name}.csv")][::2] == ["0", "0.05", "0.1", "0.2", "0.4", "0.8", "1.6"]
     evaluate.main(["attention", *test])
     entropies = [float(line.split()[-1]) for line in capsys.readouterr().out.splitlines() if "entropy" in line]
+    table = [(row["method"], row["scan"]) for row in rows(tmp_path / "attention.csv")]
+    assert table == [(name, scan) for scan in ("clean", "4 patches missing") for name in ("rolt", "no-pe-drop")]
     assert len(entropies) == 4 and min(entropies) > 0.95  # a gaze that has learned nothing is even
     assert all((tmp_path / f"{name}.png").stat().st_size > 1000 for name in ("low_frequency", "high_frequency", "attention"))
 
@@ -171,7 +176,7 @@ def test_tests_on_stairs_ask_for_their_ground_and_their_noise(tmp_path, monkeypa
         assert list(cases.values()) == [healthy()] and speed == 0.5 and terrain.columns == ("stairs",)
         asked.append((*cases, *set(terrain.levels), noise))
         figures = {"distance_m": "1", "fall_time_s": "1", "episode_return": "1"}
-        return [{"method": "rolt", "case": case, "episode": 0} | figures for case in cases]
+        return [{"method": "rolt", "seed": 0, "case": case, "episode": 0} | figures for case in cases]
 
     monkeypatch.setattr("evaluate.run_cases", record)
     card = {"robot": "a1", "task": "terrain", "policy": "rolt", "steps": 0, "seed": 0}
@@ -196,6 +201,19 @@ def test_two_variants_of_a_method_are_not_taken_for_one(tmp_path):
     quick = ["--episodes", "1", "--seconds", "0.1", "--threads", "1", "--out", str(tmp_path)]
     evaluate.main(["stiffness", "--checkpoints", *map(str, files), *quick])
     assert [row["method"] for row in rows(tmp_path / "stiffness.csv")][::5] == ["mlp (one)", "mlp (two)", "mlp"]
+
+
+def test_tables_are_of_all_shipped_seeds_and_pictures_of_the_first(tmp_path, monkeypatch):
+    monkeypatch.setattr(evaluate, "__file__", str(tmp_path / "evaluate.py"))
+    (tmp_path / "checkpoints").mkdir()
+    card = {"robot": "a1", "task": "stiffness", "policy": "rolt", "steps": 0}
+    for name, seed in (("rolt", 0), ("rolt-seed2", 2), ("rolt-seed1", 1)):
+        content = card | {"seed": seed, "weights": make_policy("rolt", A1).state_dict()}
+        checkpoint.save(content, tmp_path / "checkpoints" / f"a1-stiffness-{name}.pt")
+    args = SimpleNamespace(checkpoints=None, methods=["rolt"], task="stiffness", robot="a1")
+    for experiment, seeds in (("stiffness", [0, 1, 2]), ("gaits", [0]), ("dropout_ratio", [0])):
+        args.experiment = experiment
+        assert [card["seed"] for _, card in evaluate.find_policies(args).values()] == seeds
 
 
 def test_damage_test_stands_beside_the_papers(tmp_path, capsys):
@@ -242,6 +260,8 @@ def test_damage_test_stands_beside_the_papers(tmp_path, capsys):
         (["render.py", "good.pt", "--fault", "melt:FR"], "lock:FR_calf"),
         (["render.py", "good.pt", "--fault", "lock:MR_calf"], "no joint or leg"),
         (["render.py", "good.pt", "--out", "walk.mp4"], ".gif or a .png"),
+        (["render.py", "good.pt", "--fault", "healthy", "lock:FR_calf", "--out", "walk.gif"], "one fault"),
+        (["evaluate.py", "stiffness", "--methods", "mlp", "--checkpoints", "good.pt"], "leave one of them away"),
     ],
 )
 def test_wrong_input_ends_in_one_line(words, says, tmp_path, capsys, monkeypatch):
@@ -352,14 +372,22 @@ def test_a_torn_row_does_not_stop_the_learning_curve(tmp_path):
     assert (tmp_path / "progress.png").stat().st_size > 1000
 
 
-def test_pictures_are_written(tmp_path):
-    """Where no off-screen rendering works, the script must say so in one line."""
+def test_moving_pictures_are_written_without_a_display(tmp_path, monkeypatch):
+    """Where no off-screen rendering works, the scripts must say so in one line."""
+    for name in ("DISPLAY", "WAYLAND_DISPLAY", "MUJOCO_GL"):
+        monkeypatch.delenv(name, raising=False)
     card = {"robot": "a1", "task": "stiffness", "policy": "rolt", "steps": 0, "seed": 0}
     checkpoint.save(card | {"weights": make_policy("rolt", A1).state_dict()}, tmp_path / "policy.pt")
-    done = run("render.py", "policy.pt", "--fault", "lock:FL_calf", "--seconds", "0.4", "--out", "walk.gif", cwd=tmp_path)
-    if done.returncode == 0:
-        from PIL import Image
-
-        assert Image.open(tmp_path / "walk.gif").n_frames == 10
-    else:
-        assert done.returncode == 2 and "MUJOCO_GL" in done.stderr and done.stderr.count("\n") == 1
+    short = ["--seconds", "0.4"]
+    one = run("render.py", "policy.pt", "--fault", "lock:FL_calf", *short, "--out", "one.gif", cwd=tmp_path)
+    all_cases = ["--checkpoints", "policy.pt", "--episodes", "1", *short, "--out", ".", "--video", "all.gif"]
+    several = run("evaluate.py", "stiffness", *all_cases, cwd=tmp_path)
+    if one.returncode:
+        assert all(d.returncode == 2 and "MUJOCO_GL" in d.stderr and d.stderr.count("\n") == 1 for d in (one, several))
+        pytest.skip(f"nothing can be rendered here: {one.stderr}")
+    assert several.returncode == 0, several.stderr
+    one, several = Image.open(tmp_path / "one.gif"), Image.open(tmp_path / "all.gif")
+    assert (one.n_frames, one.size) == (10, (480, 300))  # every second step of 20
+    assert (several.n_frames, several.size) == (5, (3 * 240, 2 * 160))  # every fourth; five cases
+    colours = [len(np.unique(np.asarray(film.convert("RGB")).reshape(-1, 3), axis=0)) for film in (one, several)]
+    assert min(colours) > 10  # something is to be seen

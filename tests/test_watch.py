@@ -1,5 +1,7 @@
 """The show behind the viewers: what can be wished for while the robot walks. (The viewers themselves want eyes.)"""
 
+import sys
+
 import numpy as np
 import pytest
 
@@ -46,7 +48,7 @@ def test_a_box_comes_and_goes(show):
 def test_speed_again_and_quit(show):
     show.obey("0.4")
     show.step()
-    assert show.env.command[0, 0] == 0.4 and show.said == "healthy, 0.4 m/s"
+    assert show.env.command[0, 0] == 0.4 and show.said == "healthy, 0.4 m/s, scandots clean"
     show.obey("again")
     assert show.env.age[0] == 0 and not show.over
     show.obey("quit")
@@ -56,7 +58,9 @@ def test_speed_again_and_quit(show):
 def test_noise_changes_while_it_walks(show):
     show.obey("missing:12")
     show.step()
-    assert (show.observation.heights == 0).all() and show.said == "healthy, 0.75 m/s"
+    assert (show.observation.heights == 0).all() and show.said == "healthy, 0.75 m/s, scandots missing:12"
+    show.obey("clean+sigma:0.1")
+    assert show.said == "healthy, 0.75 m/s, scandots sigma:0.1"
     show.obey("clean")
     show.step()
     assert (show.observation.heights != 0).all()
@@ -67,6 +71,7 @@ def test_noise_changes_while_it_walks(show):
     [
         ("melt:FR", "lock:FR_calf"), ("lock:MR_calf", "no joint"), ("tow:MR", "no leg MR"), ("-1", "-1"),
         ("sigma:-1", "write clean, offset"), ("half-lock:RR_calf:5", "no stop at 5"),
+        ("tow:RR+lock:MR_calf", "no joint"), ("skate:FR+half-lock:RR_calf:5", "no stop at 5"), ("9" * 400, "at most 10"),
     ],  # fmt: skip
 )
 def test_a_wish_that_cannot_be_read_changes_nothing(show, wish, says):
@@ -86,10 +91,19 @@ def test_a_wish_that_cannot_be_read_changes_nothing(show, wish, says):
         (["--robot", "go1", "--checkpoint", "good.pt"], "not on the go1"),
         (["--video", "walk.mp4"], "a .gif file"),
         (["--robot", "a2"], "a1"),
+        (["--port", "99999"], "0 to 65535"),
+        (["--speed", "1e6"], "up to 10"),
+        (["--video", "walk.gif", "--seconds", "1e6"], "up to 120"),
+        (["--video", "walk.gif", "--seconds", "0.001", "--checkpoint", "good.pt"], "at least 0.02 s"),
+        (["--video", "/proc/here/walk.gif", "--checkpoint", "good.pt"], "choose another with --video"),
+        (["--viewer", "desktop", "--checkpoint", "good.pt"], "set DISPLAY"),
     ],
 )
 def test_wrong_input_ends_in_one_line(words, says, tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "platform", "linux")
+    monkeypatch.setenv("DISPLAY", ":99")  # a screen that is not there
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
     card = {"robot": "a1", "task": "stiffness", "policy": "mlp", "steps": 0, "seed": 0}
     checkpoint.save(card | {"weights": make_policy("mlp", A1).state_dict()}, tmp_path / "good.pt")
     with pytest.raises(SystemExit) as ended:
