@@ -190,7 +190,7 @@ def browser(show: Show, http_port: int = 0) -> None:
             imgui.SetNextWindowPos(imgui.Vec2(20, 20), imgui.Cond.FirstUseEver)
             imgui.SetNextWindowSize(imgui.Vec2(360, 160), imgui.Cond.FirstUseEver)
             if imgui.Begin("Walk")[0]:
-                imgui.TextUnformatted(show.said)
+                imgui.TextWrapped(show.said)
                 moved, speed = imgui.SliderFloat("m/s", show.speed, 0.0, 1.0, "%.2f")
                 if moved:
                     show.wishes.put(f"{speed:.2f}")
