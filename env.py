@@ -1,12 +1,12 @@
-"""N legged robots in MuJoCo, each with a fault of its own, behind the interface of a Gymnasium vector env.
+"""N legged robots in MuJoCo, each with a fault of its own, to be used much like a Gymnasium vector env.
 
 The simulator is `mujoco.batch.Batch`; this file adds what the paper's section III and legged_gym define around it:
-observations, commands, resets, pushes, terminations. Rewards are in rewards.py, faults in faults.py, the ground in
+observations, commands, resets, pushes, terminations. What is random is in episode.py, rewards are in rewards.py, faults in faults.py, the ground in
 terrain.py, the scandots in scandots.py, their noise in noise.py.
 
 Legend: N robots, L legs, J joints a leg, H = 10 steps of history. Numpy, float32 out.
 
-What a policy sees (`Observation`); scales are legged_gym's:
+What a policy sees (`Observation`); scales are legged_gym's, and the numbers those of J = 3 joints a leg:
 
     symbol     shape            meaning                                                            scale
     legs       (N, L, H, 21)    s^l of eq. 1: what each leg saw in the past 10 steps, oldest first
@@ -30,7 +30,8 @@ And what only some baselines read, empty (N, 0) unless named in `extras`:
     past       (N, L, 50, 21)   as `legs`, 50 steps long                                           as above
     situation  (N, 1)           index of the robot's fault among the env's `faults`                   1
 
-What rewards and users may read after a step (attributes of the env):
+What rewards and users may read after a step (attributes of the env; copy what you keep, some are the env's own memory; of a
+robot whose episode has ended all but the contacts are the next episode's):
 
     command (N, 3), linear_velocity (N, 3), angular_velocity (N, 3), gravity (N, 3): as above, unscaled
     joint_error, joint_velocity, torque, action, last_action (N, L, J): rad, rad/s, N m, -, -
@@ -42,23 +43,21 @@ What rewards and users may read after a step (attributes of the env):
     >>> observation, reward, terminated, truncated, info = env.step(np.zeros((4, env.num_actions)))
 """
 
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import mujoco
 import numpy as np
 from mujoco.batch import Batch
 
+from episode import CONTROL_DT, SUBSTEPS, EnvConfig
 from faults import Fault, healthy, props, write_fault
 from noise import NoisyScan, ScanNoise
 from rewards import FALL, total_reward
-from robots import PHYSICS_DT, ROBOTS, Robot, build_model
+from robots import ROBOTS, Robot, build_model
 from terrain import Terrain
 
 mujoco.set_mju_user_warning(lambda message: None)  # divergences are counted below; not on stderr and in MUJOCO_LOG.TXT
 
-SUBSTEPS = 4  # legged_gym: 50 Hz control
-CONTROL_DT = SUBSTEPS * PHYSICS_DT  # s
 HISTORY = 10  # steps (paper, section III-A)
 LONG_HISTORY = 50  # steps that RMA's adaptation reads (Kumar et al. 2021)
 EXTRAS = ("privileged", "past", "situation")
@@ -69,29 +68,6 @@ SAVED_ARRAYS = (
     "action", "last_action", "history", "command", "heading", "air_time", "age", "first_age", "command_age", "episode_return",
     "fault_index", "_last_contact", "row", "start",
 )  # fmt: skip
-
-
-@dataclass(frozen=True)
-class EnvConfig:
-    """Everything random about an episode. Ranges are (low, high), uniform."""
-
-    episode_seconds: float = 20.0  # legged_gym, and the paper's tests
-    # s that a command lasts, through falls, until the next reset after that. Ours: legged_gym draws one every 10 s and
-    # at every fall. A change within an episode changes the value more than any action does: it made 3/4 of the variance
-    # of the advantages, and two policy gradients of one policy pointed different ways (cosine 0.0; 0.6 without). A
-    # new one at a fall lets robots fall until they draw a slow one: soon nobody practises walking.
-    command_seconds: float = 20.0
-    forward_speed: tuple[float, float] = (0.0, 1.0)  # m/s; ours: the tests walk forward (legged_gym: -1 to 1)
-    lateral_speed: tuple[float, float] = (0.0, 0.0)  # m/s; ours, likewise
-    heading: tuple[float, float] = (-0.5, 0.5)  # rad, legged_gym's heading mode; ours: enough to hold a course, and
-    # early on a robot that stands is paid for not turning (legged_gym: -pi to pi, where it is paid next to nothing)
-    friction: tuple[float, float] = (0.5, 1.25)  # legged_gym
-    start_pose: tuple[float, float] = (0.5, 1.5)  # times the default joint angles, legged_gym
-    start_speed: float = 0.5  # m/s and rad/s, each component of the trunk's velocity within +-, legged_gym
-    push_seconds: float = 15.0  # legged_gym: then the trunk's velocity is redrawn
-    push_speed: float = 1.0  # m/s, x and y within +-, legged_gym; 0 = no pushes
-    start_rows: int = 3  # of the terrain, on which robots begin, ours (legged_gym: 6 of 10)
-    climb: bool = True  # from row to row by the curriculum; False = always start on the first rows
 
 
 class Observation(NamedTuple):
@@ -194,7 +170,7 @@ class LocomotionEnv:
         """One control step of 20 ms: the joint targets are default pose + action_scale * action.
 
         Args:
-            action: (N, L*J), clipped to +-10.
+            action: (N, L*J) or (N, L, J), clipped to +-10. ValueError for other shapes, FloatingPointError for NaN.
         Returns:
             observation: Observation; of a robot whose episode ended, the first one of its next episode.
             reward: (N,) float32.
@@ -206,7 +182,12 @@ class LocomotionEnv:
                 "truncated_ids" (n,) and "final_observation" (n rows), the true last observations to bootstrap from.
                 Of all n finished episodes: "episode_returns" and "episode_lengths" (n,), in steps lived.
         """
-        action = np.asarray(action, dtype=np.float64).reshape(self.action.shape)
+        if not hasattr(self, "position"):
+            raise RuntimeError("the env has no state yet: call reset() before the first step")
+        action = np.asarray(action, dtype=np.float64)
+        if action.shape not in ((self.num_envs, self.num_actions), self.action.shape):
+            raise ValueError(f"actions are ({self.num_envs}, {self.num_actions}) for these robots, not {action.shape}")
+        action = action.reshape(self.action.shape)
         if not np.isfinite(action).all():
             raise FloatingPointError("an action is not finite: the policy that made it has diverged")
         self.last_action, self.action = self.action, np.clip(action, -MAX_ACTION, MAX_ACTION)
@@ -334,7 +315,7 @@ class LocomotionEnv:
         return arrays | world | {"random": self.rng.bit_generator.state, "divergences": self.divergences}
 
     def load_state_dict(self, state: dict) -> None:
-        """The inverse of `state_dict`, for an env made with the same arguments."""
+        """The inverse of `state_dict`, for an env made with the same arguments, and pinned to the same faults if that one was."""
         for name in SAVED_ARRAYS:
             getattr(self, name)[...] = state[name]
         self.rng.bit_generator.state, self.divergences = state["random"], state["divergences"]

@@ -217,13 +217,14 @@ def ratios(policy: ROLT, args, num_envs: int = 64) -> dict[str, torch.Tensor]:
     return {scheme: ratio(masks) for scheme, masks in schemes.items()}
 
 
+SCANNING = tuple(name for name in METHODS if name not in ("roam", "module-pe"))  # whom the paper tests with noise
 # name -> (function, the task whose checkpoints it tests, the methods that it is for)
 EXPERIMENTS = {
     "stiffness": (stiffness, "stiffness", tuple(METHODS)),
     "damage": (damage, "damage", tuple(METHODS)),
     "stairs": (stairs, "terrain", tuple(METHODS)),
-    "low_frequency": (low_frequency, "terrain", ("mlp", "roll-drop", "rma", "no-pe-drop", "no-feature-drop", "rolt")),
-    "high_frequency": (high_frequency, "terrain", ("mlp", "roll-drop", "rma", "no-pe-drop", "no-feature-drop", "rolt")),
+    "low_frequency": (low_frequency, "terrain", SCANNING),
+    "high_frequency": (high_frequency, "terrain", SCANNING),
     "attention": (attention, "terrain", ("no-pe-drop", "rolt")),
     "real_world": (real_world, "stiffness", tuple(METHODS)),
     "gaits": (gaits, None, tuple(METHODS)),  # any task that the robot has
@@ -262,7 +263,8 @@ def find_policies(args) -> dict[Path, tuple]:
     for path, (_, card) in policies.items():  # seeds are put together in the tables, other variants of a method are not
         variant = path.parent.name if path.name == "policy.pt" else path.stem
         card["method"] = card["policy"] + f" ({variant})" * (alike[card["policy"], card["seed"]] > 1)
-        print(f"{card['policy']}: {path} ({card['steps'] / 1e6:.1f}M steps, seed {card['seed']})", flush=True)
+        other = f", trained on the task {card['task']}: seen and unseen are others" * (card["task"] != args.task)
+        print(f"{card['policy']}: {path} ({card['steps'] / 1e6:.1f}M steps, seed {card['seed']}{other})", flush=True)
     return policies
 
 
@@ -273,6 +275,8 @@ def rolt_or_last(args) -> torch.nn.Module:
 
 
 def video(args) -> None:
+    if not args.scenes:
+        fail("the numbers are written; there is nothing to film, for the test names no args.scenes")
     try:
         film_cases(rolt_or_last(args), args.robot, args.scenes, min(4.0, args.seconds), args.video, args.seed)
     except RuntimeError as error:

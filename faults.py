@@ -140,7 +140,7 @@ def joint_mask(parts: tuple[str, ...], robot: Robot) -> np.ndarray:
                 f"the {robot.name} has no joint or leg {part!r}; it has the legs {', '.join(robot.legs)} "
                 f"with the joints {', '.join(link.name for link in robot.links)}, as in {robot.joints[0]}"
             )
-    return np.array([joint in parts or joint.split("_")[0] in parts for joint in robot.joints])
+    return np.array([leg in parts or f"{leg}_{link.name}" in parts for leg in robot.legs for link in robot.links])
 
 
 def motor_strength(fault: Fault, robot: Robot) -> np.ndarray:
@@ -200,6 +200,11 @@ class Task:
     training: tuple[tuple[float, Fault], ...]  # (probability, fault), drawn anew at every reset
     unseen: tuple[Fault, ...]
     terrain: Terrain | None = None  # flat ground
+
+    def __post_init__(self):
+        shares = [share for share, _ in self.training]
+        if not (min(shares, default=0) > 0 and abs(sum(shares) - 1) < 1e-9):
+            raise ValueError(f"the probabilities of a task's training faults are above 0 and add up to 1, not {shares}")
 
 
 TASKS = {

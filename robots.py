@@ -55,6 +55,17 @@ class Link:
     capsule: tuple[float, Vec3, Vec3] | None  # collision shape: radius, start, end (m, link frame)
     rear_mirrors_x: bool = False  # rear legs mirror this link in x as well
 
+    def __post_init__(self):
+        if sorted(map(abs, self.axis)) != [0, 0, 1]:
+            raise ValueError(f"the {self.name} turns about {self.axis}; only axes along x, y or z can be mirrored to the left")
+        if self.rear_mirrors_x and self.axis[1]:
+            raise ValueError(f"the {self.name} turns about y: mirrored in x it would turn the other way, which is not built")
+
+    def stops(self, left: bool) -> tuple[float, float]:
+        """rad, on a left or a right leg."""
+        low, high = self.limits
+        return (-high, -low) if left and not self.axis[1] else (low, high)
+
 
 @dataclass(frozen=True)
 class Robot:
@@ -77,6 +88,18 @@ class Robot:
     action_scale: float  # rad of joint target per unit of action
     armature: float  # kg m^2, reflected rotor inertia
     friction_loss: float  # N m, dry friction of a joint
+
+    def __post_init__(self):
+        links = [link.name for link in self.links]
+        if not len(set(self.legs)) == len(self.legs) == len(self.mounts) == len(self.default_pose):
+            raise ValueError(f"{self.name}: every leg has a name of its own, a mount and a default pose")
+        for leg, mount, pose in zip(self.legs, self.mounts, self.default_pose):
+            if not len(set(links)) == len(links) == len(pose):
+                raise ValueError(f"{self.name}: every link has a name of its own, and an angle in the pose of {leg}")
+            for link, angle in zip(self.links, pose):
+                low, high = link.stops(left=mount[1] > 0)
+                if not low < angle < high:
+                    raise ValueError(f"{self.name}: {leg}_{link.name} at {angle} rad is beyond its stops, {low} and {high}")
 
     @property
     def joints(self) -> list[str]:
@@ -131,10 +154,8 @@ def build_model(
             name = f"{leg}_{link.name}"
             body = parent.add_body(name=name, pos=mount if i == 0 else mirror * link.offset)
             _set_inertia(body, link.mass, mirror * link.com, _mirror_inertia(link.inertia, mirror))
-            low, high = link.limits
             body.add_joint(
-                name=name, axis=link.axis, range=(-high, -low) if left and not link.axis[1] else (low, high), ref=0.0,
-                armature=robot.armature, frictionloss=robot.friction_loss,
+                name=name, axis=link.axis, range=link.stops(left), ref=0.0, armature=robot.armature, frictionloss=robot.friction_loss,
             )  # fmt: skip
             if link.capsule is not None:
                 radius, start, end = link.capsule
@@ -249,9 +270,9 @@ def _mirror_inertia(inertia: Inertia, mirror: np.ndarray) -> np.ndarray:
     return np.array(inertia) * [1, 1, 1, x * y, x * z, y * z]
 
 
-# Unitree A1, 12.45 kg. Source: mujoco_menagerie unitree_a1/a1.xml (masses, inertias, limits, armature, friction) and
-# legged_gym a1_config.py (pose, gains, action scale, start height). Thigh and calf boxes are capsules here: as
-# exact on steps and quicker. The hips, inside the trunk's outline, do not collide.
+# Unitree A1, 12.45 kg. Source: mujoco_menagerie unitree_a1/a1.xml (masses, inertias, limits, armature, friction),
+# Unitree's a1.urdf (trunk box), legged_gym a1_config.py (pose, gains, action scale, start height). Thigh and calf boxes are
+# capsules here: as exact on steps and quicker. The hips, inside the trunk's outline, do not collide.
 _A1_THIGH_Y = -0.08505
 
 A1 = Robot(
@@ -287,7 +308,7 @@ A1 = Robot(
     friction_loss=0.2,
 )  # fmt: skip
 
-# Unitree Go1, 12.74 kg. Source: mujoco_menagerie unitree_go1/go1.xml (masses, inertias, limits, friction), Unitree's
+# Unitree Go1, 12.74 kg. Source: mujoco_menagerie unitree_go1/go1.xml (masses, inertias, limits, armature, friction), Unitree's
 # go1.urdf (trunk box), legged_gym's a1_config.py (pose, gains, action scale: the same machine in other clothes).
 GO1 = Robot(
     name="go1",

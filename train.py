@@ -46,6 +46,7 @@ from ppo import Critic, Learner, PPOConfig, RolloutBuffer, all_reduce, collect
 from processes import orphaned, run
 from rewards import REWARDS
 from robots import ROBOTS
+from rolt import ROLT, ROLTConfig
 
 # What a run may not change when it is resumed; with several stages, which are shares of them, the steps neither.
 IDENTITY = ("robot", "task", "policy", "envs", "epochs", "minibatches", "seed", "processes", "device", "init")
@@ -306,8 +307,9 @@ def train(rank: int, args, sync: str | None, stop: list) -> None:
         policy_file = args.out / "policy.pt"
         if steps < args.steps:
             print(f"\nstopped at {steps:,} steps and saved; the same command with --resume goes on")
-        test = "stairs" if args.task == "terrain" else args.task
-        print(f"\ntrained: {policy_file}\ntest it: python evaluate.py {test} --robot {args.robot} --checkpoints {policy_file}")
+        test = {"stiffness": "stiffness", "damage": "damage", "terrain": "stairs"}.get(args.task)  # or it is a task of your own
+        words = f"{test} --robot {args.robot} --checkpoints" if test else f"watch --robot {args.robot} --checkpoint"
+        print(f"\ntrained: {policy_file}\ntest it: python evaluate.py {words} {policy_file}")
     if args.processes > 1:
         dist.destroy_process_group()
 
@@ -329,8 +331,15 @@ def from_plain(value):
 def identity(args) -> dict:
     """What a run may not change when it is resumed: its options, and the constants in the code."""
     options = {key: getattr(args, key) for key in (*IDENTITY, *(("steps",) if args.policy in STAGED else ()))}
-    configs = PPOConfig(epochs=args.epochs, minibatches=args.minibatches), EnvConfig()
+    configs = [PPOConfig(epochs=args.epochs, minibatches=args.minibatches), EnvConfig(), ROBOTS[args.robot]]
+    method = METHODS[args.policy]
+    if getattr(method, "func", method) is ROLT:  # `func` and `keywords`: of a partial, an ablation
+        configs.append(getattr(method, "keywords", {}).get("config", ROLTConfig()))
     constants = {f"{type(c).__name__}.{name}": str(value) for c in configs for name, value in asdict(c).items()}
+    for module in ("baselines", "env", "episode", "rewards", "robots", "rolt", "scandots", "terrain"):
+        for name, value in vars(sys.modules[module]).items():
+            if name.isupper() and isinstance(value, (int, float)):
+                constants[name] = str(value)
     constants |= {f"weight of {term.__name__}": str(weight) for term, weight in REWARDS.items()}
     constants["faults"] = ", ".join(f"{share:g} {fault}" for share, fault in TASKS[args.task].training)
     return options | constants | {"terrain": str(TASKS[args.task].terrain)}

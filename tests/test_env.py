@@ -27,6 +27,30 @@ def test_bit_identical_for_a_seed_at_any_number_of_threads():
     assert not all(np.array_equal(a, b) for a, b in zip(one, other))
 
 
+@pytest.mark.parametrize(
+    "change, says",
+    [
+        ({"friction": (1.25, 0.5)}, "friction is"), ({"friction": (0.0, 1.0)}, "friction is above 0"),
+        ({"heading": (0.0, np.nan)}, "heading is"), ({"push_speed": -1.0}, "push_speed is -1.0"), ({"start_rows": 0}, "at least 1 row"),
+        ({"push_seconds": 0.0}, "a control step already lasts 0.02 s"), ({"episode_seconds": np.inf}, "episode_seconds is inf"),
+    ],
+)  # fmt: skip
+def test_episodes_that_make_no_sense_are_refused(change, says):
+    with pytest.raises(ValueError, match=says):
+        EnvConfig(**change)
+
+
+def test_steps_that_make_no_sense_are_refused():
+    env = LocomotionEnv("a1", 4, num_threads=1)
+    with pytest.raises(RuntimeError, match="call reset"):
+        env.step(np.zeros((4, 12)))
+    env.reset()
+    for shape in ((12, 4), (48,), (4, 3, 4)):
+        with pytest.raises(ValueError, match=r"actions are \(4, 12\) for these robots, not"):
+            env.step(np.zeros(shape))
+    env.step(np.zeros((4, 4, 3)))
+
+
 @pytest.mark.parametrize("task", [TASKS["stiffness"], TASKS["terrain"]], ids=["flat", "terrain"])
 def test_goes_on_to_the_bit_after_a_break(task):
     def make():

@@ -1,13 +1,14 @@
 """The model against its data sheet, and faults on simulated robots."""
 
-from dataclasses import fields
+from dataclasses import fields, replace
 
 import mujoco
 import numpy as np
 import pytest
 
 from env import CONTROL_DT, EnvConfig, LocomotionEnv
-from faults import TASKS, Fault, disable, half_lock, healthy, lock, motor_strength, parse, skate, tow, weaken
+from faults import TASKS, Fault, Task, disable, half_lock, healthy, lock, motor_strength, parse, skate, tow, weaken
+from protocol import case_name
 from robots import A1, ROBOTS, build_model
 
 QUIET = EnvConfig(push_speed=0.0, start_speed=0.0, start_pose=(1.0, 1.0), friction=(1.0, 1.0))
@@ -23,7 +24,8 @@ def test_model_agrees_with_the_data(robot):
     for i, name in enumerate(robot.joints):
         link = robot.links[i % len(robot.links)]
         assert model.actuator(i).name == model.equality(i).name == name
-        turned = name.split("_")[0].endswith("L") and link.axis[1] == 0  # about x or z: left is right the other way round
+        left = robot.mounts[i // len(robot.links)][1] > 0
+        turned = left and link.axis[1] == 0  # about x or z: left is right the other way round
         assert model.joint(name).range == pytest.approx([-x for x in link.limits[::-1]] if turned else link.limits)
         assert model.actuator(i).forcerange == pytest.approx([-link.effort, link.effort])
 
@@ -70,12 +72,47 @@ def test_legs_are_mirror_images(robot):
     data = mujoco.MjData(model)
     mujoco.mj_resetDataKeyframe(model, data, 0)
     mujoco.mj_forward(model, data)
-    for right in (leg for leg in robot.legs if leg.endswith("R")):
-        left = right[:-1] + "L"
+    at = dict(zip(robot.mounts, robot.legs))
+    for right, left in ((leg, at[x, -y, z]) for (x, y, z), leg in at.items() if y < 0):
         for link in robot.links:
             twin = data.body(f"{left}_{link.name}").xipos * [1, -1, 1]
             assert data.body(f"{right}_{link.name}").xipos == pytest.approx(twin, abs=1e-6)
         assert data.geom(f"{right}_foot").xpos == pytest.approx(data.geom(f"{left}_foot").xpos * [1, -1, 1], abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    "change, says",
+    [
+        ({"legs": ("FR", "FL", "RR")}, "every leg has a name of its own, a mount and a default pose"),
+        ({"legs": ("FR", "FL", "RR", "RR")}, "every leg has a name of its own"),
+        ({"links": A1.links[:2]}, "every link has a name of its own, and an angle in the pose of FR"),
+        ({"default_pose": ((-0.1, 0.8, 1.5), *A1.default_pose[1:])}, "FR_calf at 1.5 rad is beyond its stops, -2.69653 and -0.916298"),
+    ],
+)
+def test_a_robot_that_does_not_fit_together_is_refused(change, says):
+    with pytest.raises(ValueError, match=says):
+        replace(A1, **change)
+
+
+def test_a_link_that_cannot_be_mirrored_is_refused():
+    with pytest.raises(ValueError, match="only axes along x, y or z"):
+        replace(A1.links[0], axis=(0.8, 0.6, 0))
+    with pytest.raises(ValueError, match="the thigh turns about y"):
+        replace(A1.links[1], rear_mirrors_x=True)
+
+
+def test_faults_of_legs_and_joints_with_other_names():
+    """A leg may have an underscore in its name; what has no word in the paper is called by its own name."""
+    robot = replace(A1, legs=("front_right", "front_left", "rear_right", "rear_left"))
+    strength = motor_strength(weaken("front_left", 0.5) + disable("rear_right_calf"), robot)
+    assert strength.tolist() == [1, 1, 1, 0.5, 0.5, 0.5, 1, 1, 0, 1, 1, 1]
+    assert case_name(disable("LF_HAA")) != case_name(disable("LF_HFE")) and case_name(disable("FR_tibia")) != case_name(disable("FR_thigh"))
+
+
+def test_shares_of_a_task_add_up():
+    for shares in ((0.5, 0.4), (1.0, 0.0), ()):
+        with pytest.raises(ValueError, match="add up to 1"):
+            Task(("a1",), tuple((share, healthy()) for share in shares), ())
 
 
 @pytest.mark.parametrize("robot", ROBOTS)

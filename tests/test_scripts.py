@@ -133,7 +133,7 @@ def test_all_methods_in_turn_and_evaluated_together(tmp_path, monkeypatch, capsy
     evaluate.main(["stiffness", "--checkpoints", *files, *quick])
     assert list(dict.fromkeys(row["method"] for row in rows(Path("out/stiffness.csv")))) == list(METHODS)
     capsys.readouterr()
-    evaluate.main(["dropout_ratio", "--checkpoints", files[-1], "--out", "out"])
+    evaluate.main(["dropout_ratio", "--checkpoints", "runs/a1-stiffness-rolt-seed0/policy.pt", "--out", "out"])
     table = {(row["masks"], float(row["rate"])): row for row in rows(Path("out/dropout_ratio.csv"))}
     assert all(float(table["stored", rate][k]) == pytest.approx(1, abs=1e-4) for rate in (1e-4, 0.2) for k in ("low", "high"))
     assert float(table["fresh", 0.2]["high"]) > 1.01 > float(table["none", 1e-4]["high"])

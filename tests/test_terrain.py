@@ -19,13 +19,15 @@ def test_height_is_where_rays_end():
     model = build_model(A1, terrain)
     data, rng = mujoco.MjData(model), np.random.default_rng(0)
     mujoco.mj_forward(model, data)
-    x, y = rng.uniform(-2, 27, 4000), rng.uniform(-6, 38, 4000)
+    x, y = rng.uniform(-2, 27, 4000), rng.uniform(-6, 8 * len(terrain.columns), 4000)
     geom, trunk = np.zeros(1, dtype=np.int32), model.body("trunk").id
     down = [mujoco.mj_ray(model, data, [a, b, 9.0], [0, 0, -1.0], None, 1, trunk, geom, None) for a, b in zip(x, y)]
     away = np.hypot(x, y) > 1  # from the robot's legs
     height = terrain.height(x, y)
     assert np.allclose(9.0 - np.array(down)[away], height[away], atol=1e-6)
-    assert (height > 0).mean() > 0.3 and height.max() == pytest.approx(6 * rise(10))
+    for column, kind in enumerate(terrain.columns):
+        assert (height[np.abs(y - 8 * column) < 3.5] > 0).any() == (kind != "flat")
+    assert height.max() == pytest.approx(6 * rise(10))
 
 
 def test_stairs_by_hand():

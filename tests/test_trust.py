@@ -51,6 +51,9 @@ def changed(content, key, *rest):
         (["identity", "envs", 16], "envs was 16, is 8"),
         (["identity", "PPOConfig.clip", "0.1"], "PPOConfig.clip was 0.1, is 0.2"),
         (["identity", "weight of joint_error", "-1"], "weight of joint_error was -1, is -0.04"),
+        (["identity", "FALL", "-5.0"], "FALL was -5.0, is -1.0"),
+        (["identity", "TREAD", "0.2"], "TREAD was 0.2, is 0.31"),
+        (["identity", "Robot.stiffness", "30.0"], "Robot.stiffness was 30.0, is 20.0"),
         (["iteration", ...], "does not say where"),
         (["stage", 1], "does not say where"),
         (["steps", "192"], "does not say where"),
@@ -77,6 +80,14 @@ def test_a_checkpoint_that_does_not_fit_is_refused_by_name(path_and_value, says,
 def test_a_constant_that_an_older_run_did_not_know_is_no_contradiction(trained, tmp_path):
     resume(trained, changed(trained[1], "identity", "PPOConfig.clip", ...), tmp_path)
     assert checkpoint.load(tmp_path / "checkpoint.pt")["iteration"] == 2
+
+
+def test_the_identity_of_a_run_knows_its_ablation(tmp_path):
+    def dropout(policy):
+        args = train.parse_arguments(["--policy", policy, "--out", str(tmp_path)])
+        return train.identity(args).get("ROLTConfig.pe_dropout")
+
+    assert [dropout(policy) for policy in ("rolt", "no-pe-drop", "module-pe", "mlp")] == ["0.75", "0.0", "0.75", None]
 
 
 def test_a_start_from_a_file_takes_its_weights_and_measures_anew(trained):
