@@ -20,7 +20,6 @@ import torch
 from baselines import METHODS, make_policy
 from cli import Parser, fail
 from faults import TASKS
-from normalizer import Normalizer
 from robots import ROBOTS
 
 FORMAT = 1  # raise it when files of before can no longer be read
@@ -165,7 +164,6 @@ def start_from(path: str | Path, policy: torch.nn.Module, critic: torch.nn.Modul
 
     The file may be of another method whose weights include all of the policy's (ROLT's fit the ablations of its dropout),
     and of another robot with as many legs and joints (an A1's fit a Go1).
-    What the normalizers measured is kept until the first rollout of the new run replaces it.
     CheckpointError if the file cannot be used.
     """
     content = load(path)
@@ -174,13 +172,12 @@ def start_from(path: str | Path, policy: torch.nn.Module, critic: torch.nn.Modul
         if missing:
             raise KeyError(missing[0])
         own = any(module is critic for module in policy.modules())  # ROAM's values are among its weights
-        if content.get("critic") and not own:  # a finished RMA has none
+        if content.get("critic") and not own:
             critic.load_state_dict(content["critic"])
+        elif not own:  # a policy.pt, or a finished RMA, whose last stage needs none
+            print(f"{path} holds no critic: it starts afresh")
     except (RuntimeError, TypeError, AttributeError, KeyError) as error:
         raise CheckpointError(f"the weights in {path} do not fit this policy: start from one of its own") from error
-    for module in policy.modules():
-        if isinstance(module, Normalizer):
-            module.count.zero_()
 
 
 if __name__ == "__main__":

@@ -58,10 +58,11 @@ class Normalizer(nn.Module):
             getattr(self, f"{name}_deviation").copy_((square - mean**2).clamp(min=MIN_DEVIATION**2).sqrt())
 
     @torch.no_grad()
-    def update(self, observation: Observation, sum_over_processes) -> None:
+    def update(self, observation: Observation, sum_over_processes, forget: tuple[str, ...] = ()) -> None:
         """Takes in the observations of a rollout, (T, N, ...) or (B, ...) fields.
 
-        sum_over_processes adds up a tensor over all of them (ppo.all_reduce).
+        sum_over_processes adds up a tensor over all of them (ppo.all_reduce). forget: of "legs", "heights", "privileged",
+        whose former statistics are replaced.
         """
         legs, heights = observation.legs[..., -1, :], observation.heights  # the newest step: older ones were newest once
         rows = {"legs": legs.flatten(0, -2), "heights": heights.reshape(-1, 1)}
@@ -69,9 +70,8 @@ class Normalizer(nn.Module):
             rows["privileged"] = observation.privileged.flatten(0, -2)
         samples = torch.tensor(float(len(rows["legs"])), dtype=torch.float64, device=self.count.device)
         total = sum_over_processes(samples.clone())
-        share = total / (self.count + total)
         for name, x in rows.items():
-            x = x.double()
+            x, share = x.double(), 1.0 if name in forget else total / (self.count + total)
             for kind, value in (("mean", x.mean(0)), ("square", (x**2).mean(0))):
                 value = sum_over_processes(value * samples) / total
                 running = getattr(self, f"{name}_{kind}")

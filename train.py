@@ -181,7 +181,7 @@ class Part:
         # of the simulation; on a GPU the processes of this machine (torchrun's) share its cores
         threads = max(1, args.threads // int(os.environ.get("LOCAL_WORLD_SIZE", 1))) if args.device == "cuda" else 1
         share, seeds = args.envs // args.processes, (args.seed, rank, number)
-        self.number, self.actor = number, stage.actor
+        self.number, self.actor, self.begun = number, stage.actor, False
         terrain = TASKS[args.task].terrain
         self.env = LocomotionEnv(args.robot, share, seeds, threads, stage.faults, extras=stage.extras, terrain=terrain)
         self.observation = self.env.reset(random_ages=True)
@@ -253,7 +253,7 @@ def train(rank: int, args, sync: str | None, stop: list) -> None:
             torch.set_rng_state(saved["torch"])
         except (ValueError, LookupError, OverflowError, RuntimeError) as error:  # e.g. no random state, a fault that is not
             raise CheckpointError(f"the checkpoint in {args.out} does not fit this run: {error}") from error
-        part.observation = part.env.observe()
+        part.observation, part.begun = part.env.observe(), True
 
     def save() -> None:
         """Process 0 writes the files; the others tell it their part."""
@@ -276,9 +276,13 @@ def train(rank: int, args, sync: str | None, stop: list) -> None:
             number, divergences = part.number + 1, part.env.divergences
             part = Part(number, stages[number], args, rank, policy, device)
             part.env.divergences = divergences  # of the whole run
-        if part.learner.measures and not part.actor.normalizer.count:  # the first rollout is for the normalizer alone
+        normalizer = part.actor.normalizer
+        if not part.begun and part.learner.measures and (args.init or not normalizer.count):
+            # A rollout for the normalizer alone, not among the steps. After --init only the heights are measured anew: on
+            # flat ground they hardly vary. To forget the joints' statistics, too, makes a robot that walks fall.
             part.observation, _ = collect(part.env, part.actor, part.critic, part.buffer, part.observation, generator)
-            part.actor.normalizer.update(part.buffer.observation, all_reduce)
+            normalizer.update(part.buffer.observation, all_reduce, forget=("heights",))
+        part.begun = True
         started = time.perf_counter()
         part.observation, infos = collect(part.env, part.actor, part.critic, part.buffer, part.observation, generator)
         collected = time.perf_counter()

@@ -33,6 +33,15 @@ def test_mean_and_deviation_of_all_that_was_seen():
     assert abs(seen.privileged.mean()) < 0.5 and abs(seen.past.mean()) < 0.5
 
 
+def test_what_is_to_be_forgotten_is_replaced():
+    normalizer, alone_seen, x, y = Normalizer(3), Normalizer(3), observation(0), observation(1)
+    normalizer.update(x, alone)
+    normalizer.update(y, alone, forget=("heights",))
+    alone_seen.update(y, alone)
+    assert torch.equal(normalizer(x).heights, alone_seen(x).heights) and not torch.equal(normalizer(x).legs, alone_seen(x).legs)
+    assert normalizer.count == 2 * 24
+
+
 def test_a_loaded_normalizer_answers_as_the_saved_one():
     saved, loaded, x = Normalizer(3), Normalizer(3), observation(0)
     saved.update(x, alone)

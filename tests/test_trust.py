@@ -90,15 +90,31 @@ def test_the_identity_of_a_run_knows_its_ablation(tmp_path):
     assert [dropout(policy) for policy in ("rolt", "no-pe-drop", "module-pe", "mlp")] == ["0.75", "0.0", "0.75", None]
 
 
-def test_a_start_from_a_file_takes_its_weights_and_measures_anew(trained):
-    """The policy, the critic, and what their normalizer measured, until the first rollout replaces it."""
+def test_a_start_from_a_file_takes_its_weights_and_statistics(trained, capsys):
+    """Of the policy and the critic; what a policy.pt does not hold is said."""
     content, policy = trained[1], make_policy("mlp", A1)
     critic = Critic(LocomotionEnv("a1", 1).reset(), policy.normalizer)
     checkpoint.start_from(trained[0] / "checkpoint.pt", policy, critic)
     for module, key in ((policy, "weights"), (critic, "critic")):
         for name, tensor in module.state_dict().items():
-            assert torch.equal(tensor, content[key][name]) != name.endswith("count"), name
-    assert policy.normalizer.count == 0 < content["weights"]["normalizer.count"]
+            assert torch.equal(tensor, content[key][name]), name
+    assert not capsys.readouterr().out
+    checkpoint.start_from(trained[0] / "policy.pt", policy, critic)
+    assert "holds no critic" in capsys.readouterr().out
+
+
+def test_after_a_start_from_a_file_only_the_heights_are_measured_anew(trained, tmp_path):
+    """A robot that walked on flat ground, where heights hardly vary, meets stairs; its joints' statistics are kept."""
+    weights = trained[1]["weights"]
+    legs, heights = torch.full((21,), 10.0), torch.tensor([100.0], dtype=torch.float64)
+    weights = weights | {"normalizer.legs_mean": legs.double(), "normalizer.count": torch.tensor(1e9).double()}
+    weights |= {"normalizer.heights_mean": heights, "normalizer.heights_square": heights**2}
+    checkpoint.save(trained[1] | {"weights": weights, "critic": {}}, tmp_path / "flat.pt")
+    words = ["--task", "terrain", "--steps", "192", "--out", str(tmp_path / "stairs"), "--init", str(tmp_path / "flat.pt")]
+    train.main([*COMMON, *words])
+    now = checkpoint.load(tmp_path / "stairs" / "policy.pt")["weights"]
+    assert now["normalizer.legs_mean"] == pytest.approx(10.0, abs=0.01) and abs(now["normalizer.heights_mean"]) < 5
+    assert now["normalizer.count"] == 1e9 + 2 * 8 * 24 * 4  # two rollouts, the first for the normalizer alone
 
 
 @pytest.mark.parametrize(
