@@ -38,6 +38,9 @@ INITIAL_SIGMA = ROLTConfig.initial_sigma  # the same exploration for every metho
 HEIGHT_NOISE = 0.06
 ROLL_DROP_RATE = 1e-4  # paper
 LATENT = 8  # size of RMA's z, Kumar et al.
+# Of the env steps, for the policies that act; the rest is for what chooses among them or guesses z. Ours: neither paper's
+# ratio is known for so few steps, and what learns to walk needs them most.
+FIRST_STAGES = 0.9
 
 
 @dataclass(frozen=True)
@@ -107,7 +110,7 @@ def everything(observation: Observation) -> Tensor:
 
 
 def action_layer(width: int, num_actions: int) -> nn.Linear:
-    """Starts near the default pose, as ROLT's decoder."""
+    """Starts near the default pose, as ROLT's decoder does (0.01: Andrychowicz et al. 2021, the last layer's scale)."""
     layer = nn.Linear(width, num_actions)
     nn.init.normal_(layer.weight, std=0.01)
     return layer
@@ -157,7 +160,7 @@ class RMA(Policy):
             nn.Conv2d(8, 16, 3, stride=2, padding=1), nn.ELU(), nn.Flatten(),
             nn.Linear(SCAN_SHAPE[0] * SCAN_SHAPE[1], 32), nn.ELU(),
         )  # fmt: skip
-        self.encoder = network(2 * A + 1, 256, 128, LATENT)
+        self.encoder = network(2 * A + 1, 256, 128, LATENT)  # hidden layers of 256 and 128: Kumar et al.
         self.base = network(HISTORY * frame + 32 + LATENT, *HIDDEN, A)
         self.base[-1] = action_layer(HIDDEN[-1], A)
         self.adaptation = Adaptation(frame)
@@ -173,8 +176,8 @@ class RMA(Policy):
         base = (self.heights, self.encoder, self.base, self.log_sigma)
         both = ("privileged", "past")
         return [
-            Stage("base", 0.9, task.training, self, base, extras=("privileged",)),
-            Stage("adaptation", 0.1, task.training, self, (self.adaptation,), NoCritic(), both, AdaptationLearner),
+            Stage("base", FIRST_STAGES, task.training, self, base, extras=("privileged",)),
+            Stage("adaptation", 1 - FIRST_STAGES, task.training, self, (self.adaptation,), NoCritic(), both, AdaptationLearner),
         ]
 
 
@@ -255,11 +258,11 @@ class ROAM(Policy):
         return actions.gather(1, choice[:, :, None].expand(-1, -1, actions.shape[2])).squeeze(1)
 
     def stages(self, task: Task) -> list[Stage]:
-        """Nine tenths of the steps for the behaviours, in equal parts, one tenth for the values."""
-        share, stages = 0.9 / len(task.training), []
+        """Equal parts of the steps for the behaviours, the rest for the values."""
+        share, stages = FIRST_STAGES / len(task.training), []
         for behaviour, value, (_, fault) in zip(self.behaviours, self.critics, task.training, strict=True):
             stages.append(Stage(str(fault), share, ((1.0, fault),), behaviour, (behaviour, value), value))
-        last = Stage("values", 0.1, task.training, self, (self.critics,), OwnValue(self), ("situation",), ROAMLearner)
+        last = Stage("values", 1 - FIRST_STAGES, task.training, self, (self.critics,), OwnValue(self), ("situation",), ROAMLearner)
         return [*stages, last]
 
 

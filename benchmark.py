@@ -21,6 +21,7 @@ import statistics
 import sys
 import tempfile
 import time
+from functools import partial
 
 import numpy as np
 import torch
@@ -29,7 +30,7 @@ import torch.multiprocessing as mp
 from torch import Tensor, nn
 
 from baselines import METHODS, STAGED, make_policy
-from cli import Parser, count, num_cores
+from cli import Parser, count, num_cores, threads
 from env import CONTROL_DT, LocomotionEnv
 from faults import TASKS, first_task
 from ppo import Critic, Learner, PPOConfig, RolloutBuffer, all_reduce, collect, to_tensors
@@ -242,9 +243,9 @@ def main(argv: list[str] | None = None) -> None:
     parser = Parser(__doc__)
     parser.add_argument("--robots", nargs="+", choices=ROBOTS, default=["a1", "hexapod"])
     parser.add_argument("--policies", nargs="+", choices=ONE_STAGE, default=["rolt", "mlp"])
-    parser.add_argument("--envs", type=count, default=256, help="robots simulated; each rank of the training has a quarter")
-    parser.add_argument("--rounds", type=count, default=20, help="fewer are quicker and noisier")
-    parser.add_argument("--threads", type=count, default=num_cores(), help="of the simulation, and ranks (default: cores)")
+    parser.add_argument("--envs", type=partial(count, most=2**16), default=256, help="robots simulated; each rank of the training has a quarter")
+    parser.add_argument("--rounds", type=partial(count, most=10_000), default=20, help="fewer are quicker and noisier")
+    parser.add_argument("--threads", type=threads, default=num_cores(), help="of the simulation, and ranks (default: cores)")
     parser.add_argument("--json", action="store_true", help="all figures once more, as one line of JSON")
     args = parser.parse_args(argv)
     args.envs = max(4, args.envs)

@@ -47,7 +47,9 @@ def guarded(train, rank: int, args, sync: str | None = None, told=None) -> None:
         raise
     except CheckpointError as error:
         code, says = 2, error
-    except (OSError, FloatingPointError) as error:
+    except FloatingPointError as error:  # --resume would come to the same point again, to the bit
+        code, says = 1, f"{error}: start anew with another --seed, or with another learning rate in PPOConfig"
+    except OSError as error:
         code, says = 1, f"{error}{last_saved(args)}"
     except (MemoryError, RuntimeError) as error:
         lost = "gloo" in str(error) or "NCCL" in str(error)

@@ -65,7 +65,7 @@ def parse_arguments(argv: list[str] | None = None):
     parser.add_argument("--paper", action="store_true", help="4096 robots, 400M steps, 5 epochs of 4 minibatches")
     parser.add_argument("--seed", type=seed, default=0)
     parser.add_argument("--device", choices=("auto", "cpu", "cuda"), default="auto", help="auto: cuda if there is one")
-    parser.add_argument("--threads", type=threads, default=num_cores(), help="cores to use (default: all)")
+    parser.add_argument("--threads", type=threads, help="cores to use (default: all, or as many as divide --envs)")
     parser.add_argument("--out", type=Path, help="folder of the run (default: runs/ROBOT-TASK-POLICY-seedN)")
     parser.add_argument("--resume", action="store_true", help="go on from the checkpoint in that folder")
     parser.add_argument("--init", metavar="FILE", help="start from the weights in a policy.pt or checkpoint.pt: flat, then stairs")
@@ -85,9 +85,13 @@ def parse_arguments(argv: list[str] | None = None):
         fail("torch finds no CUDA device; leave --device away to train on the CPU")
     if args.device == "auto":
         args.device = "cuda" if torch.cuda.is_available() else "cpu"
+    if args.threads is None:
+        args.threads = max(n for n in range(1, num_cores() + 1) if args.device == "cuda" or args.envs % n == 0)
     args.processes = int(os.environ.get("WORLD_SIZE", 1 if args.device == "cuda" else args.threads))
     if args.envs % args.processes:
         fail(f"{args.envs} robots do not divide among {args.processes} processes; change --envs or --threads")
+    if args.epochs * args.minibatches < 2:
+        fail("the learning rate follows from how far the first steps of an update went: at least 2 minibatches, or 2 epochs")
     if args.envs // args.processes * PPOConfig.steps < args.minibatches:
         fail(f"{args.envs} robots are too few for {args.minibatches} minibatches on {args.processes} processes")
     if args.policy == "all":
@@ -340,9 +344,9 @@ def identity(args) -> dict:
     if getattr(method, "func", method) is ROLT:  # `func` and `keywords`: of a partial, an ablation
         configs.append(getattr(method, "keywords", {}).get("config", ROLTConfig()))
     constants = {f"{type(c).__name__}.{name}": str(value) for c in configs for name, value in asdict(c).items()}
-    for module in ("baselines", "env", "episode", "rewards", "robots", "rolt", "scandots", "terrain"):
+    for module in ("baselines", "env", "episode", "normalizer", "rewards", "robots", "rolt", "scandots", "terrain"):
         for name, value in vars(sys.modules[module]).items():
-            if name.isupper() and isinstance(value, (int, float)):
+            if name.isupper() and isinstance(value, (int, float, tuple)):
                 constants[name] = str(value)
     constants |= {f"weight of {term.__name__}": str(weight) for term, weight in REWARDS.items()}
     constants["faults"] = ", ".join(f"{share:g} {fault}" for share, fault in TASKS[args.task].training)
@@ -377,7 +381,8 @@ def main(argv: list[str] | None = None) -> None:
                 fail(f"{args.out / 'checkpoint.pt'} is a policy, not a training to resume")
             differing = [f"{key} was {was[key]}, is {now[key]}" for key in now if key in was and was[key] != now[key]]
             if differing:
-                fail(f"the run in {args.out} was another one: {'; '.join(differing)}")
+                said = "; ".join(differing).replace("processes was", "processes (--threads) was")
+                fail(f"the run in {args.out} was another one: {said}; set it back, or choose another --out")
     except CheckpointError as error:
         fail(error)
     run(train, args)

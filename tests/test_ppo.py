@@ -178,6 +178,25 @@ def test_timeouts_bootstrap_from_the_true_last_observation():
     assert not torch.allclose(buffer.next_value[4], buffer.value[5])
 
 
+def test_the_buffer_holds_what_the_env_answered():
+    """A twin of the env is given the buffer's actions. One of three robots begins on its back; all time out in step 5."""
+    policy, critic, _, generator = rollout()
+    env, twin = (LocomotionEnv("a1", 3, 0, 1, config=EnvConfig(episode_seconds=0.1)) for _ in range(2))
+    observation, _ = env.reset(), twin.reset()
+    for world in (env, twin):
+        world._qpos[1, 2:7] = [0.5, 0, 1, 0, 0]
+    buffer = RolloutBuffer(8, observation, 12, policy.sample_masks(3, generator), "cpu")
+    following, _ = collect(env, policy, critic, buffer, observation, generator)
+    for t in range(8):
+        seen, reward, terminated, truncated, _ = twin.step(buffer.action[t].numpy())
+        assert buffer.reward[t].tolist() == reward.tolist()
+        assert (buffer.terminated[t].tolist(), buffer.truncated[t].tolist()) == (terminated.tolist(), truncated.tolist())
+    assert buffer.terminated[0].tolist() == [False, True, False] and buffer.truncated[4].any() and buffer.reward.std() > 0
+    assert (following.legs == seen.legs).all()
+    with torch.no_grad():
+        assert torch.equal(buffer.next_value[-1], critic(to_tensors(seen, "cpu"))) and buffer.next_value[-1].abs().min() > 0
+
+
 def test_a_gradient_that_is_not_finite_stops_training_and_names_its_tensor():
     policy, critic, buffer, generator = rollout()
     learner = Learner(policy, critic, PPOConfig())

@@ -242,6 +242,7 @@ def test_damage_test_stands_beside_the_papers(tmp_path, capsys):
         (["train.py", "--res"], "unrecognized"),
         (["train.py", "--out", "x" * 5000], "cannot write"),
         (["train.py", "--envs", "7", "--threads", "2"], "do not divide"),
+        (["train.py", "--epochs", "1", "--minibatches", "1"], "at least 2 minibatches"),
         (["train.py", "--resume", "--out", "nowhere"], "nothing to resume"),
         (["train.py", "--out", "/proc/here"], "cannot write"),
         (["evaluate.py", "swimming"], "stiffness"),
@@ -358,6 +359,12 @@ def test_a_folder_in_use_is_said_once_by_two_processes(tmp_path):
         pytest.skip("this system has no file locks")
     done = run("train.py", "--threads", "2", *SMALL, "--steps", "384", "--out", str(tmp_path), cwd=tmp_path)
     assert done.returncode == 2 and done.stderr.count("\n") == 1 and "another process is training" in done.stderr
+
+
+def test_any_number_of_cores_can_share_the_robots(tmp_path, monkeypatch):
+    for cores, used in ((1, 1), (2, 2), (6, 4), (12, 8), (20, 16), (28, 16)):
+        monkeypatch.setattr(train, "num_cores", lambda: cores)  # noqa: B023
+        assert train.parse_arguments(["--device", "cpu", "--out", str(tmp_path)]).processes == used
 
 
 def test_the_papers_size_and_what_is_said_beside_it(tmp_path):
