@@ -260,9 +260,11 @@ def find_policies(args) -> dict[Path, tuple]:
     except CheckpointError as error:
         fail(error)
     alike = Counter((card["policy"], card["seed"]) for _, card in policies.values())
-    for path, (_, card) in policies.items():  # seeds are put together in the tables, other variants of a method are not
+    lengths = Counter(policy for policy, _ in {(card["policy"], card["steps"]) for _, card in policies.values()})
+    for path, (_, card) in policies.items():  # seeds of equal length are put together in the tables, other variants are not
         variant = path.parent.name if path.name == "policy.pt" else path.stem
-        card["method"] = card["policy"] + f" ({variant})" * (alike[card["policy"], card["seed"]] > 1)
+        apart = alike[card["policy"], card["seed"]] > 1 or lengths[card["policy"]] > 1
+        card["method"] = card["policy"] + f" ({variant})" * apart
         other = f", trained on the task {card['task']}: seen and unseen are others" * (card["task"] != args.task)
         print(f"{card['policy']}: {path} ({card['steps'] / 1e6:.1f}M steps, seed {card['seed']}{other})", flush=True)
     return policies

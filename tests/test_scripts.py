@@ -201,6 +201,9 @@ def test_two_variants_of_a_method_are_not_taken_for_one(tmp_path):
     quick = ["--episodes", "1", "--seconds", "0.1", "--threads", "1", "--out", str(tmp_path)]
     evaluate.main(["stiffness", "--checkpoints", *map(str, files), *quick])
     assert [row["method"] for row in rows(tmp_path / "stiffness.csv")][::5] == ["mlp (one)", "mlp (two)", "mlp"]
+    checkpoint.save(card | {"steps": 9, "weights": make_policy("mlp", A1).state_dict()}, files[0])  # trained for longer
+    evaluate.main(["stiffness", "--checkpoints", str(files[0]), str(files[2]), *quick])
+    assert [row["method"] for row in rows(tmp_path / "stiffness.csv")][::5] == ["mlp (one)", "mlp (other-seed)"]
 
 
 def test_tables_are_of_all_shipped_seeds_and_pictures_of_the_first(tmp_path, monkeypatch):
