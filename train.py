@@ -280,12 +280,11 @@ def train(rank: int, args, sync: str | None, stop: list) -> None:
             number, divergences = part.number + 1, part.env.divergences
             part = Part(number, stages[number], args, rank, policy, device)
             part.env.divergences = divergences  # of the whole run
-        normalizer = part.actor.normalizer
-        if not part.begun and part.learner.measures and (args.init or not normalizer.count):
+        if not part.begun and part.learner.measures and (args.init or not part.actor.normalizer.count):
             # A rollout for the normalizer alone, not among the steps. After --init only the heights are measured anew: on
             # flat ground they hardly vary. To forget the joints' statistics, too, makes a robot that walks fall.
             part.observation, _ = collect(part.env, part.actor, part.critic, part.buffer, part.observation, generator)
-            normalizer.update(part.buffer.observation, all_reduce, forget=("heights",))
+            part.actor.normalizer.update(part.buffer.observation, all_reduce, forget=("heights",))
         part.begun = True
         started = time.perf_counter()
         part.observation, infos = collect(part.env, part.actor, part.critic, part.buffer, part.observation, generator)

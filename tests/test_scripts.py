@@ -119,6 +119,8 @@ def test_a_run_of_several_stages_goes_on_to_the_bit(policy, tmp_path, monkeypatc
     with pytest.raises(SystemExit):
         train.main([*common, "--out", str(whole), "--resume", "--steps", "3840"])
     assert "steps was 1920, is 3840" in capsys.readouterr().err
+    train.main([*common, "--out", str(tmp_path / "after"), "--init", str(whole / "policy.pt")])
+    assert [row["stage"] for row in rows(tmp_path / "after" / "progress.csv")] == stages
 
 
 def test_all_methods_in_turn_and_evaluated_together(tmp_path, monkeypatch, capsys):
