@@ -188,7 +188,7 @@ def browser(show: Show, http_port: int = 0) -> None:
         @messages.handler
         def draw(self, _: messages.BuildGuiEvent) -> None:
             imgui.SetNextWindowPos(imgui.Vec2(20, 20), imgui.Cond.FirstUseEver)
-            imgui.SetNextWindowSize(imgui.Vec2(360, 160), imgui.Cond.FirstUseEver)
+            imgui.SetNextWindowSize(imgui.Vec2(380, 200), imgui.Cond.FirstUseEver)
             if imgui.Begin("Walk")[0]:
                 imgui.TextWrapped(show.said)
                 moved, speed = imgui.SliderFloat("m/s", show.speed, 0.0, 1.0, "%.2f")

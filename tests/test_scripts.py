@@ -366,17 +366,6 @@ def test_a_folder_in_use_is_said_once_by_two_processes(tmp_path):
     assert done.returncode == 2 and done.stderr.count("\n") == 1 and "another process is training" in done.stderr
 
 
-def test_any_number_of_cores_can_share_the_robots(tmp_path, monkeypatch):
-    for cores, used in ((1, 1), (2, 2), (6, 4), (12, 8), (20, 16), (28, 16)):
-        monkeypatch.setattr(train, "num_cores", lambda: cores)  # noqa: B023
-        assert train.parse_arguments(["--device", "cpu", "--out", str(tmp_path)]).processes == used
-
-
-def test_the_papers_size_and_what_is_said_beside_it(tmp_path):
-    args = train.parse_arguments(["--paper", "--envs", "1024", "--device", "cpu", "--out", str(tmp_path)])
-    assert (args.envs, args.steps, args.epochs, args.minibatches) == (1024, 400_000_000, 5, 4)
-
-
 def test_a_torn_row_does_not_stop_the_learning_curve(tmp_path):
     header = "steps,speed,commanded_speed,episode_return,episode_seconds,sigma,kl"
     (tmp_path / "progress.csv").write_text(f"{header}\n1,0,0,1,1,1,0\n2,0,0\n3,0,0,1,1,1,0,9\n4,0,0,1,1,1,0\n")

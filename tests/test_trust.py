@@ -204,3 +204,14 @@ def test_a_diverged_robot_never_reaches_the_buffer(tmp_path, monkeypatch):
     assert divergences == "48"  # 24 steps for the normalizer, and 24
     weights = checkpoint.load(tmp_path / "policy.pt")["weights"].values()
     assert all(torch.isfinite(x).all() for x in weights)
+
+
+def test_any_number_of_cores_can_share_the_robots(tmp_path, monkeypatch):
+    for cores, used in ((1, 1), (2, 2), (6, 4), (12, 8), (20, 16), (28, 16)):
+        monkeypatch.setattr(train, "num_cores", lambda: cores)  # noqa: B023
+        assert train.parse_arguments(["--device", "cpu", "--out", str(tmp_path)]).processes == used
+
+
+def test_the_papers_size_and_what_is_said_beside_it(tmp_path):
+    args = train.parse_arguments(["--paper", "--envs", "1024", "--device", "cpu", "--out", str(tmp_path)])
+    assert (args.envs, args.steps, args.epochs, args.minibatches) == (1024, 400_000_000, 5, 4)
