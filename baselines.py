@@ -38,8 +38,8 @@ INITIAL_SIGMA = ROLTConfig.initial_sigma  # the same exploration for every metho
 HEIGHT_NOISE = 0.06
 ROLL_DROP_RATE = 1e-4  # paper
 LATENT = 8  # size of RMA's z, Kumar et al.
-# Of the env steps, for the policies that act; the rest is for what chooses among them or guesses z. Ours: neither paper's
-# ratio is known for so few steps, and what learns to walk needs them most.
+# Share of the env steps for the policies that act; the rest is for what chooses among them or guesses z. Ours: walking takes
+# longest to learn.
 FIRST_STAGES = 0.9
 
 
@@ -110,7 +110,8 @@ def everything(observation: Observation) -> Tensor:
 
 
 def action_layer(width: int, num_actions: int) -> nn.Linear:
-    """Starts near the default pose, as ROLT's decoder does (0.01: Andrychowicz et al. 2021, the last layer's scale)."""
+    """Starts near the default pose, as ROLT's decoder. (0.01: ours; that a policy's last layer should be small is advice of
+    Andrychowicz et al. 2021.)"""
     layer = nn.Linear(width, num_actions)
     nn.init.normal_(layer.weight, std=0.01)
     return layer
@@ -262,7 +263,8 @@ class ROAM(Policy):
         share, stages = FIRST_STAGES / len(task.training), []
         for behaviour, value, (_, fault) in zip(self.behaviours, self.critics, task.training, strict=True):
             stages.append(Stage(str(fault), share, ((1.0, fault),), behaviour, (behaviour, value), value))
-        last = Stage("values", 1 - FIRST_STAGES, task.training, self, (self.critics,), OwnValue(self), ("situation",), ROAMLearner)
+        rest, values = 1 - FIRST_STAGES, (self.critics,)
+        last = Stage("values", rest, task.training, self, values, OwnValue(self), ("situation",), ROAMLearner)
         return [*stages, last]
 
 

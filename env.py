@@ -1,8 +1,8 @@
 """N legged robots in MuJoCo, each with a fault of its own, to be used much like a Gymnasium vector env.
 
 The simulator is `mujoco.batch.Batch`; this file adds what the paper's section III and legged_gym define around it:
-observations, commands, resets, pushes, terminations. What is random is in episode.py, rewards are in rewards.py, faults in faults.py, the ground in
-terrain.py, the scandots in scandots.py, their noise in noise.py.
+observations, commands, resets, pushes, terminations. What is random is in episode.py, rewards are in rewards.py, faults in
+faults.py, the ground in terrain.py, the scandots in scandots.py, their noise in noise.py.
 
 Legend: N robots, L legs, J joints a leg, H = 10 steps of history. Numpy, float32 out.
 

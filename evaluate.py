@@ -272,8 +272,8 @@ def find_policies(args) -> dict[Path, tuple]:
 
 def rolt_or_last(args) -> torch.nn.Module:
     """The policy to be watched."""
-    policies = [policy for policy, _ in args.policies.values()]
-    return next((policy for policy, card in args.policies.values() if card["policy"] == "rolt"), policies[-1])
+    *_, (last, _) = args.policies.values()
+    return next((policy for policy, card in args.policies.values() if card["policy"] == "rolt"), last)
 
 
 def video(args) -> None:

@@ -58,8 +58,8 @@ class Link:
     def __post_init__(self):
         if sorted(map(abs, self.axis)) != [0, 0, 1]:
             raise ValueError(f"the {self.name} turns about {self.axis}; only axes along x, y or z can be mirrored to the left")
-        if self.rear_mirrors_x and self.axis[1]:
-            raise ValueError(f"the {self.name} turns about y: mirrored in x it would turn the other way, which is not built")
+        if self.rear_mirrors_x and not self.axis[0] and self.limits[0] != -self.limits[1]:
+            raise ValueError(f"the stops of the {self.name} would have to be mirrored for rear legs, too, which is not built")
 
     def stops(self, left: bool) -> tuple[float, float]:
         """rad, on a left or a right leg."""
@@ -155,7 +155,8 @@ def build_model(
             body = parent.add_body(name=name, pos=mount if i == 0 else mirror * link.offset)
             _set_inertia(body, link.mass, mirror * link.com, _mirror_inertia(link.inertia, mirror))
             body.add_joint(
-                name=name, axis=link.axis, range=link.stops(left), ref=0.0, armature=robot.armature, frictionloss=robot.friction_loss,
+                name=name, axis=link.axis, range=link.stops(left), ref=0.0,
+                armature=robot.armature, frictionloss=robot.friction_loss,
             )  # fmt: skip
             if link.capsule is not None:
                 radius, start, end = link.capsule

@@ -380,8 +380,8 @@ def main(argv: list[str] | None = None) -> None:
                 fail(f"{args.out / 'checkpoint.pt'} is a policy, not a training to resume")
             differing = [f"{key} was {was[key]}, is {now[key]}" for key in now if key in was and was[key] != now[key]]
             if differing:
-                said = "; ".join(differing).replace("processes was", "processes (--threads) was")
-                fail(f"the run in {args.out} was another one: {said}; set it back, or choose another --out")
+                way = "set it back (processes: --threads), or choose another --out"
+                fail(f"the run in {args.out} was another one: {'; '.join(differing)}; {way}")
     except CheckpointError as error:
         fail(error)
     run(train, args)

@@ -97,7 +97,7 @@ def test_a_robot_that_does_not_fit_together_is_refused(change, says):
 def test_a_link_that_cannot_be_mirrored_is_refused():
     with pytest.raises(ValueError, match="only axes along x, y or z"):
         replace(A1.links[0], axis=(0.8, 0.6, 0))
-    with pytest.raises(ValueError, match="the thigh turns about y"):
+    with pytest.raises(ValueError, match="the stops of the thigh would have to be mirrored"):
         replace(A1.links[1], rear_mirrors_x=True)
 
 
