@@ -1,13 +1,14 @@
 """The methods that the paper compares ROLT with (section IV), each whole in one place, and the list of them all.
 
     MLP         all that ROLT sees, flat, into [512, 256, 128]
+    Mirrored MLP  (ours) the MLP averaged with its answer to the mirrored state
     Roll-Drop   the same network; neurons are dropped in the rollout only (Campanaro et al. 2023)
     RMA         a base policy that is told what is wrong with the robot, then an adaptation module that guesses it
                 from the past second (Kumar et al. 2021)
     ROAM        a behaviour a training situation, chosen step by step by value functions (Chen et al. 2024)
-    Module PE, No PE Drop, No Feature Drop: switches of ROLT (rolt.py)
+    Module PE, No PE Drop, No Feature Drop, and ours, No Leg Frames and No Identity: switches of ROLT (rolt.py)
 
-A policy is a module with forward(observation, masks) -> (B, A) mean action, sigma() -> (A,), sample_masks(n, generator)
+A policy is a module with forward(observation, masks) -> (B, A) mean action, std() -> (A,), sample_masks(n, generator)
 -> {name: (n, ...) bool}, and a few words on itself (`extras` and what follows in ROLT). How it is
 trained is a list of `Stage`s: most have one.
 
@@ -17,30 +18,26 @@ Legend: B samples, L legs, J joints a leg, A = L*J actions, H = 10 steps of hist
 """
 
 from dataclasses import dataclass, replace
-from functools import partial
 
 import torch
 from torch import Tensor, nn
 from torch.utils.benchmark import Timer
 
-from env import HISTORY, LocomotionEnv, Observation
+from env import HISTORY, LONG_HISTORY, LocomotionEnv, Observation
 from faults import TASKS, Fault, Task, first_task
-from normalizer import Normalizer
-from ppo import Learner, PPOConfig, to_tensors
+from ppo import Learner, PPOConfig, network, proprioception, to_tensors
 from robots import ROBOTS, Robot
-from rolt import LOG_SIGMA_BOUNDS, ROLT, Masks, ROLTConfig, drop
-from scandots import SCAN_SHAPE
+from rolt import LOG_STD_BOUNDS, ROLT, Decoder, Masks, ROLTConfig, drop
+from noise import HEIGHT_SCALE, SCAN_SHAPE
 
 HIDDEN = (512, 256, 128)  # legged_gym
-INITIAL_SIGMA = ROLTConfig.initial_sigma  # the same exploration for every method
 # m, standard deviation. The paper adds Gaussian noise in the training of MLP and RMA, without a number; legged_gym's uniform
 # +-0.1 m has this deviation.
 HEIGHT_NOISE = 0.06
 ROLL_DROP_RATE = 1e-4  # paper
 LATENT = 8  # size of RMA's z, Kumar et al.
-# Share of the env steps for the policies that act; the rest is for what chooses among them or guesses z. Ours: walking takes
-# longest to learn.
-FIRST_STAGES = 0.9
+# Steps of a last stage, which chooses among policies or guesses z, relative to the steps of a policy that acts. Ours.
+LAST_STAGE = 0.2
 
 
 @dataclass(frozen=True)
@@ -48,7 +45,7 @@ class Stage:
     """A part of a method's training: who acts where, who learns what."""
 
     name: str
-    share: float  # of the run's env steps
+    share: float  # env steps, relative to the run's --steps
     faults: tuple[tuple[float, Fault], ...]  # the robots' situations
     actor: nn.Module
     trained: tuple[nn.Module | nn.Parameter, ...]  # all other weights of the policy are frozen
@@ -57,30 +54,36 @@ class Stage:
     learner: type[Learner] = Learner
 
 
-def network(*sizes: int) -> nn.Sequential:
-    """Linear layers with ELU between them (legged_gym)."""
-    layers = [module for a, b in zip(sizes, sizes[1:]) for module in (nn.Linear(a, b), nn.ELU())]
-    return nn.Sequential(*layers[:-1])
-
-
-def proprioception(legs: Tensor) -> Tensor:
-    """(B, L, H, 3J + 12) -> (B, H, L*3J + 12): what all legs see, what they share (velocities, command) once."""
-    return torch.cat([legs[..., :-12].transpose(1, 2).flatten(2), legs[:, 0, :, -12:]], dim=2)
-
-
 class Policy(nn.Module):
     """What the baselines share unless they say otherwise (the words are explained in ROLT)."""
 
-    extras = ()
-    height_noise = 0.0
     replays_masks = True
-    micro_batch = 1024  # more than ROLT's: wide layers and few activations
+    leg_frames = True
+    height_noise = 0.0  # m, added to the scan in training
 
-    def sigma(self) -> Tensor:
-        return self.log_sigma.clamp(*LOG_SIGMA_BOUNDS).exp()
+    def __init__(self, robot: Robot, scan: bool):
+        super().__init__()
+        self.num_legs, self.num_joints = len(robot.legs), len(robot.links)
+        self.num_actions = self.num_legs * self.num_joints
+        self.frame = 3 * self.num_actions + 12  # numbers that the whole robot sees in one step
+        self.extras = ("heights",) if scan else ()
+        self.num_heights = SCAN_SHAPE[0] * SCAN_SHAPE[1] if scan else 0
+        self.log_std = nn.Parameter(torch.full((self.num_actions,), ROLTConfig.initial_std).log())
+
+    def std(self) -> Tensor:
+        return self.log_std.clamp(*LOG_STD_BOUNDS).exp()
 
     def sample_masks(self, n: int, generator: torch.Generator) -> Masks:
-        return {}
+        """The noise on the heights is drawn and stored as dropout masks are: the update sees what the rollout saw, and the
+        critic sees clean heights."""
+        if not (self.height_noise and self.num_heights):
+            return {}
+        noise = torch.randn(n, *SCAN_SHAPE, generator=generator, device=generator.device)
+        return {"height_noise": HEIGHT_SCALE * self.height_noise * noise}
+
+    def heights_of(self, observation: Observation, masks: Masks | None) -> Tensor:
+        """(B, 16, 12) or (B, 0)"""
+        return observation.heights + (masks or {}).get("height_noise", 0.0)
 
 
 class MLP(Policy):
@@ -88,33 +91,38 @@ class MLP(Policy):
 
     height_noise = HEIGHT_NOISE
 
-    def __init__(self, num_legs: int, num_joints: int):
-        super().__init__()
-        A = num_legs * num_joints
-        self.normalizer = Normalizer(num_joints)
-        sizes = (HISTORY * (3 * A + 12) + SCAN_SHAPE[0] * SCAN_SHAPE[1], *HIDDEN)
+    def __init__(self, robot: Robot, task: Task, scan: bool):
+        super().__init__(robot, scan)
+        sizes = (HISTORY * self.frame + self.num_heights, *HIDDEN)
         self.hidden = nn.ModuleList(nn.Linear(a, b) for a, b in zip(sizes, sizes[1:]))
-        self.decoder = action_layer(sizes[-1], A)
-        self.log_sigma = nn.Parameter(torch.full((A,), INITIAL_SIGMA).log())
+        self.decoder = Decoder(sizes[-1], self.num_actions)
 
     def forward(self, observation: Observation, masks: Masks | None = None) -> Tensor:
-        x = everything(self.normalizer(observation))
+        x = torch.cat([proprioception(observation.legs), self.heights_of(observation, masks).flatten(1)], dim=1)
         for i, layer in enumerate(self.hidden):
             x = drop(nn.functional.elu(layer(x)), (masks or {}).get(f"hidden_{i}"), ROLL_DROP_RATE)
         return self.decoder(x)
 
 
-def everything(observation: Observation) -> Tensor:
-    """(B, 480 + 192) of an A1: proprioception and heights."""
-    return torch.cat([proprioception(observation.legs).flatten(1), observation.heights.flatten(1)], dim=1)
+class MirroredMLP(MLP):
+    """Our control: an MLP averaged with its answer to the mirrored state, mirrored back. Symmetry, but no legs that share.
 
+    In leg frames the mirror image of a state is the same numbers with left and right legs exchanged (and the scan's columns
+    reversed): a robot that limps on FL is to it a mirrored robot that limps on FR.
+    """
 
-def action_layer(width: int, num_actions: int) -> nn.Linear:
-    """Starts near the default pose, as ROLT's decoder. (0.01: ours; that a policy's last layer should be small is advice of
-    Andrychowicz et al. 2021.)"""
-    layer = nn.Linear(width, num_actions)
-    nn.init.normal_(layer.weight, std=0.01)
-    return layer
+    def __init__(self, robot: Robot, task: Task, scan: bool):
+        super().__init__(robot, task, scan)
+        mirrored = [(x, -y, z) for x, y, z in robot.mounts]
+        self.swap = [robot.mounts.index(mount) for mount in mirrored]  # the leg on the other side
+
+    def forward(self, observation: Observation, masks: Masks | None = None) -> Tensor:
+        heights, noise = observation.heights, (masks or {}).get("height_noise")
+        legs, heights = observation.legs[:, self.swap], heights.flip(2) if heights.numel() else heights
+        image = observation._replace(legs=legs, heights=heights)
+        image_masks = None if noise is None else {"height_noise": noise.flip(2)}
+        back = super().forward(image, image_masks).unflatten(1, (self.num_legs, -1))[:, self.swap].flatten(1)
+        return (super().forward(observation, masks) + back) / 2
 
 
 class RollDrop(MLP):
@@ -131,10 +139,10 @@ class RollDrop(MLP):
     replays_masks = False
 
     def sample_masks(self, n: int, generator: torch.Generator) -> Masks:
-        def keep(width: int) -> Tensor:
-            return torch.rand(n, width, generator=generator, device=generator.device) >= ROLL_DROP_RATE
-
-        return {f"hidden_{i}": keep(layer.out_features) for i, layer in enumerate(self.hidden)}
+        return {
+            f"hidden_{i}": torch.rand(n, layer.out_features, generator=generator, device=generator.device) >= ROLL_DROP_RATE
+            for i, layer in enumerate(self.hidden)
+        }
 
 
 # ---------------------------------------------------------------------- RMA
@@ -148,37 +156,39 @@ class RMA(Policy):
     `past` is there.
     """
 
-    extras = ("past",)
     height_noise = HEIGHT_NOISE
 
-    def __init__(self, num_legs: int, num_joints: int):
-        super().__init__()
-        A = num_legs * num_joints
-        frame = 3 * A + 12
-        self.normalizer = Normalizer(num_joints, num_privileged=2 * A + 1)
-        self.heights = nn.Sequential(  # the paper's "CNN to encode height values"; sizes ours
-            nn.Unflatten(1, (1, SCAN_SHAPE[0])), nn.Conv2d(1, 8, 3, stride=2, padding=1), nn.ELU(),
-            nn.Conv2d(8, 16, 3, stride=2, padding=1), nn.ELU(), nn.Flatten(),
-            nn.Linear(SCAN_SHAPE[0] * SCAN_SHAPE[1], 32), nn.ELU(),
-        )  # fmt: skip
-        self.encoder = network(2 * A + 1, 256, 128, LATENT)  # hidden layers of 256 and 128: Kumar et al.
-        self.base = network(HISTORY * frame + 32 + LATENT, *HIDDEN, A)
-        self.base[-1] = action_layer(HIDDEN[-1], A)
-        self.adaptation = Adaptation(frame)
-        self.log_sigma = nn.Parameter(torch.full((A,), INITIAL_SIGMA).log())
+    def __init__(self, robot: Robot, task: Task, scan: bool):
+        super().__init__(robot, scan)
+        self.extras += ("past",)
+        features = 32 if scan else 0
+        if scan:
+            self.heights = nn.Sequential(  # the paper's "CNN to encode height values"; sizes ours
+                nn.Unflatten(1, (1, SCAN_SHAPE[0])), nn.Conv2d(1, 8, 3, stride=2, padding=1), nn.ELU(),
+                nn.Conv2d(8, 16, 3, stride=2, padding=1), nn.ELU(), nn.Flatten(),
+                nn.Linear(self.num_heights, features), nn.ELU(),
+            )  # fmt: skip
+        self.encoder = network(2 * self.num_actions + 1, 256, 128, LATENT)  # hidden layers of 256 and 128: Kumar et al.
+        self.base = nn.Sequential(
+            network(HISTORY * self.frame + features + LATENT, *HIDDEN), nn.ELU(), Decoder(HIDDEN[-1], self.num_actions)
+        )
+        self.adaptation = Adaptation(self.frame)
 
     def forward(self, observation: Observation, masks: Masks | None = None) -> Tensor:
-        observation = self.normalizer(observation)
-        z = self.adaptation(observation.past) if observation.past.numel() else self.encoder(observation.privileged)
-        senses = proprioception(observation.legs).flatten(1), self.heights(observation.heights)
-        return self.base(torch.cat([*senses, z], dim=1))
+        guessed = observation.past.numel() > 0
+        z = self.adaptation(observation.past) if guessed else self.encoder(observation.privileged)
+        parts = [proprioception(observation.legs), z]
+        if self.num_heights:
+            parts.append(self.heights(self.heights_of(observation, masks)))
+        return self.base(torch.cat(parts, dim=1))
 
     def stages(self, task: Task) -> list[Stage]:
-        base = (self.heights, self.encoder, self.base, self.log_sigma)
-        both = ("privileged", "past")
+        scan = ("heights",) if self.num_heights else ()
+        base = (self.encoder, self.base, self.log_std, *([self.heights] if scan else []))
+        both = (*scan, "privileged", "past")
         return [
-            Stage("base", FIRST_STAGES, task.training, self, base, extras=("privileged",)),
-            Stage("adaptation", 1 - FIRST_STAGES, task.training, self, (self.adaptation,), NoCritic(), both, AdaptationLearner),
+            Stage("base", 1.0, task.training, self, base, extras=(*scan, "privileged")),
+            Stage("adaptation", LAST_STAGE, task.training, self, (self.adaptation,), NoCritic(), both, AdaptationLearner),
         ]
 
 
@@ -195,7 +205,7 @@ class Adaptation(nn.Module):
 
     def forward(self, past: Tensor) -> Tensor:
         """(B, L, 50, 3J + 12) -> (B, 8)"""
-        return self.time(self.step(proprioception(past)).transpose(1, 2))
+        return self.time(self.step(proprioception(past).unflatten(1, (LONG_HISTORY, -1))).transpose(1, 2))
 
 
 class NoCritic(nn.Module):
@@ -208,17 +218,14 @@ class NoCritic(nn.Module):
 class AdaptationLearner(Learner):
     """Stage 2: mean squared error between the guessed z and the encoder's."""
 
-    measures = False  # the base is frozen, and so is what it sees
+    def __init__(self, policy: RMA, critic: NoCritic, config: PPOConfig, bf16: bool = False):
+        super().__init__(policy, critic, replace(config, learning_rate=1e-3), bf16)  # ours: supervised learning bears more
 
-    def __init__(self, policy: RMA, critic: NoCritic, config: PPOConfig):
-        super().__init__(policy, critic, replace(config, learning_rate=1e-3))  # ours: supervised learning bears more
-
-    def loss(self, batch: dict, old_sigma: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
-        observation = self.policy.normalizer(batch["observation"])
+    def loss(self, batch: dict, old_std: Tensor, progress: float) -> tuple[Tensor, dict[str, Tensor]]:
         with torch.no_grad():
-            truth = self.policy.encoder(observation.privileged)
-        error = (self.policy.adaptation(observation.past) - truth).square().mean()
-        return error, {"other_loss": error.detach()}
+            truth = self.policy.encoder(batch["observation"].privileged)
+        error = (self.policy.adaptation(batch["observation"].past) - truth).square().mean()
+        return error, {"other_loss": error}
 
 
 # ---------------------------------------------------------------------- ROAM
@@ -231,16 +238,17 @@ class ROAM(Policy):
     observation names it) and the values learn who belongs where.
     """
 
-    def __init__(self, num_legs: int, num_joints: int, num_situations: int = 2):
-        super().__init__()
-        inputs = HISTORY * (3 * num_legs * num_joints + 12) + SCAN_SHAPE[0] * SCAN_SHAPE[1]
-        self.behaviours = nn.ModuleList(MLP(num_legs, num_joints) for _ in range(num_situations))
-        self.critics = nn.ModuleList(BehaviourValue(inputs, behaviour.normalizer) for behaviour in self.behaviours)
+    def __init__(self, robot: Robot, task: Task, scan: bool):
+        super().__init__(robot, scan)
+        self.behaviours = nn.ModuleList(MLP(robot, task, scan) for _ in task.training)
+        inputs = HISTORY * self.frame + self.num_heights
+        self.critics = nn.ModuleList(BehaviourValue(inputs) for _ in task.training)
         self.generator = torch.Generator().manual_seed(0)  # of the choice at test
-        self.picked = torch.zeros(0, num_situations)  # (B, K) how often each robot chose each behaviour at test
+        self.picked = torch.zeros(0, len(task.training))  # (B, K) how often each robot chose each behaviour at test
+        del self.log_std  # each behaviour has its own
 
-    def sigma(self) -> Tensor:
-        return torch.stack([behaviour.sigma() for behaviour in self.behaviours]).mean(0)
+    def std(self) -> Tensor:
+        return torch.stack([behaviour.std() for behaviour in self.behaviours]).mean(0)
 
     def values(self, observation: Observation) -> Tensor:
         """(B, K)"""
@@ -259,25 +267,24 @@ class ROAM(Policy):
         return actions.gather(1, choice[:, :, None].expand(-1, -1, actions.shape[2])).squeeze(1)
 
     def stages(self, task: Task) -> list[Stage]:
-        """Equal parts of the steps for the behaviours, the rest for the values."""
-        share, stages = FIRST_STAGES / len(task.training), []
-        for behaviour, value, (_, fault) in zip(self.behaviours, self.critics, task.training, strict=True):
-            stages.append(Stage(str(fault), share, ((1.0, fault),), behaviour, (behaviour, value), value))
-        rest, values = 1 - FIRST_STAGES, (self.critics,)
-        last = Stage("values", rest, task.training, self, values, OwnValue(self), ("situation",), ROAMLearner)
+        """All steps for each of the behaviours, and some for the values."""
+        stages, extras = [], self.extras
+        for behaviour, (_, fault) in zip(self.behaviours, task.training, strict=True):
+            stages.append(Stage(str(fault), 1.0, ((1.0, fault),), behaviour, (behaviour,), extras=extras))
+        extras, values = (*extras, "situation"), (self.critics,)
+        last = Stage("values", LAST_STAGE, task.training, self, values, OwnValue(self), extras, ROAMLearner)
         return [*stages, last]
 
 
 class BehaviourValue(nn.Module):
-    """V_i(s), on what the MLP sees (the other methods' critic sees its previous action twice)."""
+    """V_i(s), on what the behaviour sees: at test nobody knows more."""
 
-    def __init__(self, inputs: int, normalizer: Normalizer):
+    def __init__(self, inputs: int):
         super().__init__()
-        self.normalizer = normalizer  # the behaviour's
         self.network = network(inputs, *HIDDEN, 1)
 
     def forward(self, observation: Observation) -> Tensor:
-        return self.network(everything(self.normalizer(observation))).squeeze(1)
+        return self.network(torch.cat([proprioception(observation.legs), observation.heights.flatten(1)], dim=1)).squeeze(1)
 
 
 class OwnValue(nn.Module):
@@ -305,45 +312,47 @@ def roam_loss(values: Tensor, situation: Tensor, target: Tensor, weight: float =
 class ROAMLearner(Learner):
     """The last stage: nothing but the values learns."""
 
-    measures = False
+    def __init__(self, policy: ROAM, critic: OwnValue, config: PPOConfig, bf16: bool = False):
+        super().__init__(policy, critic, replace(config, learning_rate=config.critic_learning_rate), bf16)
 
-    def __init__(self, policy: ROAM, critic: OwnValue, config: PPOConfig):
-        super().__init__(policy, critic, replace(config, learning_rate=config.critic_learning_rate))
-
-    def loss(self, batch: dict, old_sigma: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
+    def loss(self, batch: dict, old_std: Tensor, progress: float) -> tuple[Tensor, dict[str, Tensor]]:
         observation = batch["observation"]
         situation = observation.situation.squeeze(1).long()
-        bellman, entropy = roam_loss(self.policy.values(observation), situation, batch["value_target"])
-        return bellman + entropy, {"value_loss": bellman.detach(), "other_loss": entropy.detach()}
+        bellman, entropy = roam_loss(self.policy.values(observation), situation, batch["returns"])
+        return bellman + entropy, {"value_loss": bellman, "other_loss": entropy}
 
 
 # ---------------------------------------------------------------------- all of them
 
-# `train.py --policy`, in the order in which results list them.
+# `train.py --policy`, in the order in which results list them: a class, or a configuration of ROLT.
 METHODS = {
     "mlp": MLP,
+    "mirrored-mlp": MirroredMLP,
     "roll-drop": RollDrop,
     "rma": RMA,
     "roam": ROAM,
-    "module-pe": partial(ROLT, config=ROLTConfig(leg_pe=True)),
-    "no-pe-drop": partial(ROLT, config=ROLTConfig(pe_dropout=0.0)),
-    "no-feature-drop": partial(ROLT, config=ROLTConfig(feature_dropout=0.0)),
-    "rolt": ROLT,
+    "module-pe": ROLTConfig(identity="embedding"),
+    "no-pe-drop": ROLTConfig(pe_dropout=0.0),
+    "no-feature-drop": ROLTConfig(feature_dropout=0.0),
+    "no-leg-frames": ROLTConfig(leg_frames=False),
+    "no-identity": ROLTConfig(identity="none"),
+    "rolt": ROLTConfig(),
 }
-STAGED = tuple(name for name, method in METHODS.items() if hasattr(method, "stages"))  # trained in more than one way
 
 
-def make_policy(name: str, robot: Robot, task: Task = TASKS["stiffness"]) -> nn.Module:
-    """A policy for the robot, with fresh weights from torch's global generator. The task matters to ROAM alone."""
-    options = {"num_situations": len(task.training)} if name == "roam" else {}
-    return METHODS[name](len(robot.legs), len(robot.links), **options)
+def make_policy(name: str, robot: Robot, task: Task, scan: bool) -> nn.Module:
+    """A policy for the robot, with fresh weights from torch's global generator. scan: does it read the heights?"""
+    method = METHODS[name]
+    if isinstance(method, ROLTConfig):
+        return ROLT(len(robot.legs), len(robot.links), replace(method, scan=scan))
+    return method(robot, task, scan)
 
 
 def training_stages(policy: nn.Module, task: Task) -> list[Stage]:
-    """How the policy is trained, one stage after the other; their shares of the steps add up to 1."""
+    """How the policy is trained, one stage after the other."""
     if hasattr(policy, "stages"):
         return policy.stages(task)
-    return [Stage("ppo", 1.0, task.training, policy, (policy,))]
+    return [Stage("ppo", 1.0, task.training, policy, (policy,), extras=policy.extras)]
 
 
 def main() -> None:
@@ -351,7 +360,7 @@ def main() -> None:
     for robot in ROBOTS.values():
         print(f"{robot.name:18}{'parameters':>12}{'one robot acts in':>20}{'256 robots':>14}   (one thread)")
         for name in METHODS:
-            policy, times = make_policy(name, robot, TASKS[first_task(robot.name)]).eval(), []
+            policy, times = make_policy(name, robot, TASKS[first_task(robot.name)], False).eval(), []
             for n in (1, 256):
                 observation = to_tensors(LocomotionEnv(robot, n, extras=policy.extras).reset(), "cpu")
                 times.append(Timer("policy(observation)", globals={"policy": policy, "observation": observation}))

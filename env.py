@@ -1,93 +1,129 @@
 """N legged robots in MuJoCo, each with a fault of its own, to be used much like a Gymnasium vector env.
 
 The simulator is `mujoco.batch.Batch`; this file adds what the paper's section III and legged_gym define around it:
-observations, commands, resets, pushes, terminations. What is random is in episode.py, rewards are in rewards.py, faults in
-faults.py, the ground in terrain.py, the scandots in scandots.py, their noise in noise.py.
+observations, commands, resets, pushes, terminations. Rewards are in rewards.py, faults in faults.py, the ground in
+terrain.py, the scandots and their noise in noise.py.
 
 Legend: N robots, L legs, J joints a leg, H = 10 steps of history. Numpy, float32 out.
 
-What a policy sees (`Observation`); scales are legged_gym's, and the numbers those of J = 3 joints a leg:
+What a policy sees (`Observation`); the numbers are those of J = 3 joints a leg:
 
-    symbol     shape            meaning                                                            scale
+    symbol     shape            meaning                                                     scale
     legs       (N, L, H, 21)    s^l of eq. 1: what each leg saw in the past 10 steps, oldest first
-      0:3                       joint position, hip thigh calf [rad]                               1
-      3:6                       joint velocity [rad/s]                                             0.05
-      6:9                       previous target angle of the leg's joints [rad]                    1
-      9:12                      velocity command forward, left [m/s], yaw [rad/s]                  2, 2, 0.25
-      12:15                     trunk linear velocity in the trunk's frame [m/s]                   2
-      15:18                     trunk angular velocity in the trunk's frame [rad/s]                0.25
-      18:21                     direction of gravity in the trunk's frame                          1
-    action     (N, L*J)         a_{t-1} of eq. 2, the previous target angles of all joints [rad]   1
-    heights    (N, 16, 12)      s_e: clip(trunk z - 0.5 m - ground z, -1, 1) at the scandots       5
+      0:3                       joint angle beyond the default pose, hip thigh calf [rad]   4
+      3:6                       joint velocity [rad/s]                                      0.2
+      6:9                       previous action: target angle beyond the default pose       1
+      9:12                      command: velocity forward, left [m/s], yaw [rad/s]          2
+      12:15                     trunk linear velocity in the trunk's frame [m/s]            2
+      15:18                     trunk angular velocity in the trunk's frame [rad/s]         1
+      18:21                     direction of gravity in the trunk's frame, less (0, 0, -1)  5
+    action     (N, L*J)         a_{t-1} of eq. 2: the previous actions of all legs          1
 
-Angles are absolute, as the paper writes ("joints' position", "the last output target angles"; legged_gym subtracts the
-default pose). The default pose differs a little from leg to leg (the A1's hips are turned outwards, to -0.1 right and
-+0.1 left), which helps ROLT to tell its legs apart.
+All of it is in *leg frames*: what a left leg sees and does is mirrored to the right, so that the same number
+means the same motion and the same push on every leg, and what one leg learns holds on the other side, too.
+Right legs, such as the first one, see the trunk's own numbers. The scales make a walk's numbers about 1.
 
-And what only some baselines read, empty (N, 0) unless named in `extras`:
+What only some read is empty, (N, 0), unless named in `extras`; `privileged` is for critics and RMA's base:
 
-    privileged (N, 2*L*J + 1)   is the joint locked, its motor's strength, the friction               1
-    past       (N, L, 50, 21)   as `legs`, 50 steps long                                           as above
-    situation  (N, 1)           index of the robot's fault among the env's `faults`                   1
+    privileged (N, 2*L*J + 1)   is the joint locked, its motor's strength, the friction     1
+    heights    (N, 16, 12)      s_e: trunk z - 0.5 m - ground z at the scandots, +-1 m      5
+    past       (N, L, 50, 21)   as `legs`, 50 steps long                                    as above
+    situation  (N, 1)           index of the robot's fault among the env's `faults`         1
 
-What rewards and users may read after a step (attributes of the env; copy what you keep, some are the env's own memory; of a
+What rewards and users may read after a step (attributes; copy what you keep, some are the env's own memory; of a
 robot whose episode has ended all but the contacts are the next episode's):
 
-    command (N, 3), linear_velocity (N, 3), angular_velocity (N, 3), gravity (N, 3): as above, unscaled
-    joint_error, joint_velocity, torque, action, last_action (N, L, J): rad, rad/s, N m, -, -
+    command, linear_velocity, angular_velocity, gravity (N, 3)  as above, unscaled
+    joint_error, joint_velocity, torque (N, L, J)               rad, rad/s, N m, in the URDF's frames
+    action, last_action (N, L, J)                               in leg frames
     link_contact (N, L*links with a capsule), foot_contact, touchdown (N, L) bool; air_time (N, L) s
-    position (N, 3) m, yaw (N,) rad: the trunk in the world
+    position (N, 3) m, yaw (N,) rad                             the trunk in the world
 
     >>> env = LocomotionEnv("a1", num_envs=4)
     >>> observation = env.reset()
     >>> observation, reward, terminated, truncated, info = env.step(np.zeros((4, env.num_actions)))
 """
 
+from dataclasses import asdict, dataclass
 from typing import NamedTuple
 
 import mujoco
 import numpy as np
 from mujoco.batch import Batch
 
-from episode import CONTROL_DT, SUBSTEPS, EnvConfig
 from faults import Fault, healthy, props, write_fault
 from noise import NoisyScan, ScanNoise
 from rewards import FALL, total_reward
-from robots import ROBOTS, Robot, build_model
+from robots import PHYSICS_DT, ROBOTS, Robot, build_model
 from terrain import Terrain
 
-mujoco.set_mju_user_warning(lambda message: None)  # divergences are counted below; not on stderr and in MUJOCO_LOG.TXT
+mujoco.set_mju_user_warning(lambda message: None)  # divergences are counted below, not logged to a file
 
+SUBSTEPS = 4  # legged_gym: 50 Hz control
+CONTROL_DT = SUBSTEPS * PHYSICS_DT  # s
 HISTORY = 10  # steps (paper, section III-A)
 LONG_HISTORY = 50  # steps that RMA's adaptation reads (Kumar et al. 2021)
-EXTRAS = ("privileged", "past", "situation")
+JOINT_SCALE = np.array([[4.0], [0.2], [1.0]])  # angle, velocity, action; ours, as the next line (NOTES)
+TRUNK_SCALE = np.repeat((2.0, 2.0, 1.0, 5.0), 3)  # command, linear velocity, angular velocity, gravity
+# A mirror in the trunk's x-z plane changes the sign of a velocity's y, and of a turn's x and z.
+MIRROR = np.array([1, -1, -1, 1, -1, 1, -1, 1, -1, 1, -1, 1])
 MAX_ACTION = 10.0  # ours: 2.5 rad (hexapod: 1.5) from the default pose, far beyond what walking needs
-MAX_SPEED = 1000.0  # m/s and rad/s, ours: flailing at the motors' limits reaches 100; beyond is a simulation that ran away
-MAX_TILT = np.cos(np.deg2rad(60))  # ours: past 60 degrees no robot here gets up again; legged_gym waits for contact
-SAVED_ARRAYS = (
-    "action", "last_action", "history", "command", "heading", "air_time", "age", "first_age", "command_age", "episode_return",
-    "fault_index", "_last_contact", "row", "start",
+MAX_SPEED = 1000.0  # m/s, rad/s, ours: flailing at the motors' limits reaches 100; beyond it ran away
+MAX_TILT = np.cos(np.deg2rad(60))  # ours: past 60 degrees none gets up again; legged_gym waits for contact
+EXTRAS = ("privileged", "heights", "past", "situation")
+SAVED = (
+    "action", "last_action", "history", "command", "heading", "air_time", "age", "first_age", "command_age",
+    "episode_return", "fault_index", "_last_contact", "row", "start",
 )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class EnvConfig:
+    """All that training, tests and pictures ask differently of the same env. Ranges are (low, high), uniform."""
+
+    leg_frames: bool = True  # left legs see and act mirrored; False = the URDF's frames, our No Leg Frames
+    episode_seconds: float = 20.0  # legged_gym, and the paper's tests
+    # s that a command lasts, through falls, until the next reset after that; ours (NOTES; legged_gym: 10)
+    command_seconds: float = 20.0
+    # m/s; ours: the tests walk forward, and to stand earns nothing (NOTES; legged_gym: -1 to 1)
+    forward_speed: tuple[float, float] = (0.3, 1.0)
+    lateral_speed: tuple[float, float] = (0.0, 0.0)  # m/s; ours, likewise
+    heading: tuple[float, float] = (-0.5, 0.5)  # rad, legged_gym's heading mode; ours: enough to hold a course
+    friction: tuple[float, float] = (0.5, 1.25)  # legged_gym, drawn once a robot there, here at every reset
+    start_pose: tuple[float, float] = (0.5, 1.5)  # times the default joint angles, legged_gym
+    start_speed: float = 0.5  # m/s and rad/s, each component of the trunk's velocity within +-, legged_gym
+    push_seconds: float = 15.0  # legged_gym: then the trunk's velocity is redrawn
+    push_speed: float = 1.0  # m/s, x and y within +-, legged_gym; 0 = no pushes
+    start_rows: int = 3  # of the terrain, on which robots begin, ours (legged_gym: 6 of 10)
+    climb: bool = True  # from row to row by the curriculum; False = always start on the first rows
+
+    def __post_init__(self):
+        for name, value in asdict(self).items():
+            low, high = value if isinstance(value, tuple) else (0, value)
+            if not -np.inf < low <= high < np.inf:
+                raise ValueError(f"{name} is {value}; ranges are (low, high), all numbers finite, single ones >= 0")
+            if name.endswith("_seconds") and value < CONTROL_DT:
+                raise ValueError(f"{name} is {value}; a control step already lasts {CONTROL_DT} s")
 
 
 class Observation(NamedTuple):
     """See the table at the head of this file. Fields are arrays here and tensors in the learner."""
 
-    legs: np.ndarray  # (N, L, H, 21)
-    action: np.ndarray  # (N, L*J)
-    heights: np.ndarray  # (N, 16, 12)
-    privileged: np.ndarray  # (N, 2*L*J + 1) or (N, 0)
-    past: np.ndarray  # (N, L, 50, 21) or (N, 0)
-    situation: np.ndarray  # (N, 1) or (N, 0)
+    legs: np.ndarray
+    action: np.ndarray
+    privileged: np.ndarray
+    heights: np.ndarray
+    past: np.ndarray
+    situation: np.ndarray
 
 
 class LocomotionEnv:
     """N robots of one kind; robot i's episode ends, and is restarted by `step`, on its own.
 
-    faults: (probability, fault) pairs; each reset draws one. `pin_faults` fixes one a robot instead. Boxes and skates
-        are there only if one of `faults` needs them.
+    faults: (probability, fault) pairs; each reset draws one. `pin_faults` fixes one a robot instead. Boxes and
+        skates are there only if one of `faults` needs them.
     num_threads: of the simulator, 0 = one a core. Results do not depend on it.
-    extras: which of privileged, past and situation the observation holds. None of them changes the simulation.
+    extras: which of `EXTRAS` the observation holds. None of them changes the simulation.
     terrain: None = flat ground. Robot i stays on column i modulo the number of columns.
     noise: on the scandots, for tests; from a generator of its own, so that it changes nothing else.
     """
@@ -108,15 +144,16 @@ class LocomotionEnv:
             raise ValueError(f"unknown robot {robot!r}; there is {', '.join(ROBOTS)}")
         if num_envs < 1:
             raise ValueError(f"num_envs is at least 1, not {num_envs}")
-        self.robot = robot = ROBOTS[robot] if isinstance(robot, str) else robot
         if unknown := set(extras) - set(EXTRAS):
-            raise ValueError(f"unknown extras {', '.join(sorted(unknown))}; there is {', '.join(EXTRAS)}")
+            raise ValueError(f"unknown extras {', '.join(unknown)}; there is {', '.join(EXTRAS)}")
+        self.robot = robot = ROBOTS[robot] if isinstance(robot, str) else robot
         self.num_envs, self.config, self.extras = num_envs, config, extras
         self.num_legs, self.num_joints = len(robot.legs), len(robot.links)
         self.num_actions = self.num_legs * self.num_joints
         self.episode_steps = round(config.episode_seconds / CONTROL_DT)
         self.rng = np.random.default_rng(seed)
         self.terrain, self.scan = terrain, NoisyScan(num_envs, terrain, noise, seed)
+
         self.model = build_model(robot, terrain, **props([fault for _, fault in faults]))
         self.world = Batch(self.model, nsim=num_envs, nthread=num_threads, persistent=True)
         self._qpos, self._qvel, self._ctrl = (self.world.bind(name) for name in ("qpos", "qvel", "ctrl"))
@@ -126,25 +163,31 @@ class LocomotionEnv:
         self._trunk_sensor = [names.index("trunk")]
         self._foot_sensors = [names.index(f"{leg}_foot") for leg in robot.legs]
         self._link_sensors = [i for i, name in enumerate(names) if name in robot.joints]
-
+        self._joints = np.array([self.model.joint(name).id for name in robot.joints])  # (L*J,), without wheels
+        self._angle_at = self.model.jnt_qposadr[self._joints]
+        self._velocity_at = self.model.jnt_dofadr[self._joints]
         self._default = np.array(robot.default_pose)  # (L, J)
-        self._joints = np.array([self.model.joint(name).id for name in robot.joints])  # (L*J,) ids, without wheels
-        self._angle_at, self._velocity_at = self.model.jnt_qposadr[self._joints], self.model.jnt_dofadr[self._joints]
+
+        # Leg frames. A mount with y > 0 is of a left leg. In its mirror image a turn about y stays as it is, and one
+        # about x or z turns the other way; so do the numbers of MIRROR. All signs 1 are the frames of the URDF.
+        left = (np.array([y for _, y, _ in robot.mounts]) > 0) & config.leg_frames  # (L,)
+        turned = np.array([link.axis[1] == 0 for link in robot.links])  # (J,)
+        self._joint_sign = np.where(left[:, None] & turned, -1.0, 1.0)  # (L, J)
+        self._trunk_sign = np.where(left[:, None], MIRROR, 1.0)  # (L, 12)
+
         self.faults = [fault for _, fault in faults]
         self._fault_odds = np.array([probability for probability, _ in faults])
-        self._pinned, self.fault_index = False, np.zeros(num_envs, dtype=int)  # (N,) which of `faults` each robot has
-
+        self._pinned, self.fault_index = False, np.zeros(num_envs, dtype=int)  # (N,) which of `faults` each has
         shape = (num_envs, self.num_legs, self.num_joints)
-        self.action, self.last_action = np.zeros(shape), np.zeros(shape)
         memory = LONG_HISTORY if "past" in extras else HISTORY
-        self.history = np.zeros((num_envs, self.num_legs, memory, 12 + 3 * self.num_joints), dtype=np.float32)
+        self.history = np.zeros((*shape[:2], memory, 12 + 3 * self.num_joints), dtype=np.float32)
+        self.action, self.last_action = np.zeros(shape), np.zeros(shape)
         self.command, self.heading = np.zeros((num_envs, 3)), np.zeros(num_envs)
         self.air_time, self._last_contact = np.zeros(shape[:2]), np.zeros(shape[:2], dtype=bool)
         # (N,) steps: since the reset, of which not lived (`random_ages`), since the command
         self.age, self.first_age, self.command_age = np.zeros((3, num_envs), dtype=int)
         self.episode_return = np.zeros(num_envs)
-        self.divergences = 0  # simulations that were given up, in total
-        self.row, self.start = np.zeros(num_envs, dtype=int), np.zeros((num_envs, 2))  # where on the terrain it began, m
+        self.row, self.start = np.zeros(num_envs, dtype=int), np.zeros((num_envs, 2))  # where it began, m
         self.column = np.arange(num_envs) % (len(terrain.columns) if terrain else 1)
 
     # ------------------------------------------------------------------ interface
@@ -160,14 +203,16 @@ class LocomotionEnv:
         everyone = np.arange(self.num_envs)
         self._resample_commands(everyone)
         if self.terrain:
-            self.row[:] = self.rng.integers(min(self.config.start_rows, len(self.terrain.levels)), size=self.num_envs)
+            rows = min(self.config.start_rows, len(self.terrain.levels))
+            self.row[:] = self.rng.integers(rows, size=self.num_envs)
         self._reset(everyone)
         if random_ages:
-            self.age[:] = self.first_age[:] = self.command_age[:] = self.rng.integers(self.episode_steps, size=self.num_envs)
+            ages = self.rng.integers(self.episode_steps, size=self.num_envs)
+            self.age[:] = self.first_age[:] = self.command_age[:] = ages
         return self.observe()
 
     def step(self, action: np.ndarray) -> tuple[Observation, np.ndarray, np.ndarray, np.ndarray, dict]:
-        """One control step of 20 ms: the joint targets are default pose + action_scale * action.
+        """One control step of 20 ms: the joint targets are default pose + action_scale * action, in leg frames.
 
         Args:
             action: (N, L*J) or (N, L, J), clipped to +-10. ValueError for other shapes, FloatingPointError for NaN.
@@ -178,20 +223,21 @@ class LocomotionEnv:
                 diverged.
             truncated: (N,) bool, the time was up.
             info: of the state that the step led to, before any reset: "rewards" {term: (N,)} weighted, per second,
-                "position" (N, 3) m, "speed" and "commanded_speed" forward (N,) m/s, "diverged" (N,) bool. Of time-outs:
-                "truncated_ids" (n,) and "final_observation" (n rows), the true last observations to bootstrap from.
-                Of all n finished episodes: "episode_returns" and "episode_lengths" (n,), in steps lived.
+                "position" (N, 3) m, "speed" and "commanded_speed" forward (N,) m/s, "diverged" (N,) bool.
+                Of time-outs: "truncated_ids" (n,) and "final_observation" (n rows), the true last observations to
+                bootstrap from. Of all n finished episodes: "episode_returns" and "episode_lengths" (n,), in steps.
         """
         if not hasattr(self, "position"):
             raise RuntimeError("the env has no state yet: call reset() before the first step")
         action = np.asarray(action, dtype=np.float64)
         if action.shape not in ((self.num_envs, self.num_actions), self.action.shape):
-            raise ValueError(f"actions are ({self.num_envs}, {self.num_actions}) for these robots, not {action.shape}")
+            raise ValueError(f"actions are ({self.num_envs}, {self.num_actions}), not {action.shape}")
         action = action.reshape(self.action.shape)
         if not np.isfinite(action).all():
             raise FloatingPointError("an action is not finite: the policy that made it has diverged")
         self.last_action, self.action = self.action, np.clip(action, -MAX_ACTION, MAX_ACTION)
-        self._ctrl[:] = self._target().reshape(self.num_envs, -1)
+        targets = self._default + self.robot.action_scale * self._joint_sign * self.action  # (N, L, J) rad
+        self._ctrl[:] = targets.reshape(self.num_envs, -1)
         self.world.step(nstep=SUBSTEPS, stage=mujoco.mjtStage.mjSTAGE_VEL)
         self.age += 1
         self.command_age += 1
@@ -208,16 +254,18 @@ class LocomotionEnv:
         truncated = (self.age >= self.episode_steps) & ~terminated
         self.air_time *= ~self.foot_contact
         info = {"rewards": terms, "position": self.position, "diverged": diverged}
-        info["speed"], info["commanded_speed"] = self.linear_velocity[:, 0], self.command[:, 0].copy()
+        info |= {"speed": self.linear_velocity[:, 0], "commanded_speed": self.command[:, 0].copy()}
 
         self._push()
         self._steer()
-        self._remember()
+        self.history[:, :, :-1] = self.history[:, :, 1:]
+        self.history[:, :, -1] = self._frame()
 
         ended = np.flatnonzero(terminated | truncated)
         info["truncated_ids"] = np.flatnonzero(truncated)
-        info["final_observation"] = self.observe(np.flatnonzero(truncated))
-        info["episode_returns"], info["episode_lengths"] = self.episode_return[ended].copy(), (self.age - self.first_age)[ended]
+        info["final_observation"] = self.observe(info["truncated_ids"])
+        info["episode_returns"] = self.episode_return[ended].copy()
+        info["episode_lengths"] = (self.age - self.first_age)[ended]
         if len(ended):
             self._climb(ended[~diverged[ended]])  # whose position is none
             self._reset(ended)
@@ -226,16 +274,18 @@ class LocomotionEnv:
     def observe(self, ids: np.ndarray | slice = slice(None)) -> Observation:
         """The current observation of all robots or of the n robots `ids` (a copy)."""
         history = self.history[ids]
-        target = self._target()[ids].reshape(len(history), self.num_actions).astype(np.float32)
-        heights = self.scan.read(np.arange(self.num_envs)[ids], self.position[ids], self.yaw[ids])
+        action = self.action[ids].reshape(len(history), self.num_actions).astype(np.float32)
         extra = {name: np.zeros((len(history), 0), dtype=np.float32) for name in EXTRAS}
         if "privileged" in self.extras:
             extra["privileged"] = self._privileged()[ids]
+        if "heights" in self.extras:
+            everyone = np.arange(self.num_envs)
+            extra["heights"] = self.scan.read(everyone[ids], self.position[ids], self.yaw[ids])
         if "past" in self.extras:
             extra["past"] = history.copy()
         if "situation" in self.extras:
             extra["situation"] = self.fault_index[ids, None].astype(np.float32)
-        return Observation(history[:, :, -HISTORY:].copy(), target, heights, **extra)
+        return Observation(history[:, :, -HISTORY:].copy(), action, **extra)
 
     # ------------------------------------------------------------------ episode
 
@@ -249,9 +299,10 @@ class LocomotionEnv:
         velocity = self.rng.uniform(-config.start_speed, config.start_speed, size=(n, 6))
         self._friction[ids, :, 0] = self.rng.uniform(*config.friction, size=(n, 1))
         for index in np.unique(self.fault_index[ids]):
-            chosen = self.fault_index[ids] == index
-            write_fault(self.faults[index], self.robot, self.world, ids[chosen])
-        locked, limits = self.world.bind("eq_active")[ids] > 0, self.world.expand("jnt_range")[ids][:, self._joints]
+            write_fault(self.faults[index], self.robot, self.world, ids[self.fault_index[ids] == index])
+
+        locked = self.world.bind("eq_active")[ids] > 0
+        limits = self.world.expand("jnt_range")[ids][:, self._joints]
         pose = np.clip(pose.reshape(n, -1), limits[:, :, 0], limits[:, :, 1])
         self._qpos[ids[:, None], self._angle_at] = np.where(locked, self._default.reshape(-1), pose)
         self._qvel[ids, :6] = velocity
@@ -275,8 +326,8 @@ class LocomotionEnv:
         """The terrain's curriculum, at the end of an episode."""
         if self.terrain and self.config.climb:
             distance = np.linalg.norm(self.position[ids, :2] - self.start[ids], axis=1)
-            speed = np.linalg.norm(self.command[ids, :2], axis=1)
-            self.row[ids] = self.terrain.next_row(self.row[ids], distance, speed, self.config.episode_seconds, self.rng)
+            commanded = np.linalg.norm(self.command[ids, :2], axis=1) * self.config.episode_seconds
+            self.row[ids] = self.terrain.next_row(self.row[ids], distance, commanded, self.rng)
 
     def _resample_commands(self, ids: np.ndarray) -> None:
         """A forward and a lateral speed, and a heading, for each of the robots `ids`."""
@@ -297,32 +348,30 @@ class LocomotionEnv:
             self._qvel[due, :2] = self.rng.uniform(-speed, speed, size=(int(due.sum()), 2))
 
     def _diverged(self) -> np.ndarray:
-        """(N,) bool, simulations that MuJoCo warns about (it has reset most of them) or whose state ran away; afterwards all
-        states are finite."""
-        wild = ~((np.abs(self._qvel).max(axis=1) < MAX_SPEED) & np.isfinite(self._qpos).all(axis=1))  # NaN is not < either
-        diverged = wild | (self.world.warning[:, :, 1] > 0).any(axis=1)
-        if wild.any():
-            self.world.reset(np.flatnonzero(wild), keyframe=0, stage=mujoco.mjtStage.mjSTAGE_VEL)
-        self.divergences += int(diverged.sum())
-        return diverged
+        """(N,) bool, simulations that MuJoCo warns about (it has reset most of them) or whose state ran away;
+        afterwards all states are finite."""
+        tame = (np.abs(self._qvel).max(axis=1) < MAX_SPEED) & np.isfinite(self._qpos).all(axis=1)  # NaN is not <
+        if not tame.all():
+            self.world.reset(np.flatnonzero(~tame), keyframe=0, stage=mujoco.mjtStage.mjSTAGE_VEL)
+        return ~tame | (self.world.warning[:, :, 1] > 0).any(axis=1)
 
     # ------------------------------------------------------------------ going on after a break
 
     def state_dict(self) -> dict:
-        """All that the next step depends on, but for noise on the scan, which is for tests (arrays, lists and numbers)."""
-        arrays = {name: getattr(self, name).copy() for name in SAVED_ARRAYS}
-        world = {"state": self.world.state.copy(), "friction": self._friction.copy()}
-        return arrays | world | {"random": self.rng.bit_generator.state, "divergences": self.divergences}
+        """All that the next step depends on, but for noise on the scan, which is for tests."""
+        arrays = {name: getattr(self, name).copy() for name in SAVED}
+        arrays |= {"world": self.world.state.copy(), "friction": self._friction.copy()}
+        return arrays | {"random": self.rng.bit_generator.state}
 
     def load_state_dict(self, state: dict) -> None:
-        """The inverse of `state_dict`, for an env made with the same arguments, and pinned to the same faults if that one was."""
-        for name in SAVED_ARRAYS:
+        """The inverse of `state_dict`, for an env made with the same arguments and pinned to the same faults."""
+        for name in SAVED:
             getattr(self, name)[...] = state[name]
-        self.rng.bit_generator.state, self.divergences = state["random"], state["divergences"]
+        self.rng.bit_generator.state = state["random"]
         for index in np.unique(self.fault_index):
             write_fault(self.faults[index], self.robot, self.world, np.flatnonzero(self.fault_index == index))
         self._friction[...] = state["friction"]
-        self.world.state[...] = state["state"]
+        self.world.state[...] = state["world"]
         self.world.forward(stage=mujoco.mjtStage.mjSTAGE_VEL)
         self._read_state()
 
@@ -335,10 +384,10 @@ class LocomotionEnv:
         w, x, y, z = self._qpos[:, 3:7].T
         self.position = self._qpos[:, :3].copy()
         self.yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
-        forward = np.stack([1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)], axis=1)
-        left = np.stack([2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)], axis=1)
-        up = np.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)], axis=1)
-        rotation = np.stack([forward, left, up], axis=1)  # (N, 3, 3), world -> trunk
+        forward = [1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)]
+        left = [2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)]
+        up = [2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)]
+        rotation = np.array([forward, left, up]).transpose(2, 0, 1)  # (N, 3, 3), world -> trunk
         self.linear_velocity = np.einsum("nij,nj->ni", rotation, self._qvel[:, :3])
         self.angular_velocity = self._qvel[:, 3:6].copy()
         self.gravity = -rotation[:, :, 2]
@@ -356,26 +405,18 @@ class LocomotionEnv:
         self.touchdown = self.foot_contact & (self.air_time > 0)
         self.air_time += CONTROL_DT
 
-    def _target(self) -> np.ndarray:
-        """(N, L, J) rad, the joint angles that the action asks for."""
-        return self._default + self.robot.action_scale * self.action
-
     def _frame(self) -> np.ndarray:
         """(N, L, 21), the newest step of every leg's history."""
-        body = np.concatenate(
-            [self.command * (2, 2, 0.25), self.linear_velocity * 2, self.angular_velocity * 0.25, self.gravity], axis=1
-        )  # (N, 12)
-        body = np.broadcast_to(body[:, None], (self.num_envs, self.num_legs, 12))
-        position = self._default + self.joint_error
-        frame = np.concatenate([position, self.joint_velocity * 0.05, self._target(), body], axis=2)
-        return frame.astype(np.float32)
-
-    def _remember(self) -> None:
-        self.history[:, :, :-1] = self.history[:, :, 1:]
-        self.history[:, :, -1] = self._frame()
+        shape = (self.num_envs, self.num_legs, -1)
+        angle, velocity = self._joint_sign * self.joint_error, self._joint_sign * self.joint_velocity
+        joints = JOINT_SCALE * np.stack([angle, velocity, self.action], axis=2)  # (N, L, 3, J)
+        upright = self.gravity - (0, 0, -1)
+        trunk = [self.command, self.linear_velocity, self.angular_velocity, upright]
+        trunk = TRUNK_SCALE * np.concatenate(trunk, axis=1)  # (N, 12)
+        return np.concatenate([joints.reshape(shape), trunk[:, None] * self._trunk_sign], axis=2, dtype=np.float32)
 
     def _privileged(self) -> np.ndarray:
         """(N, 2*L*J + 1), what no robot can measure."""
         locked = self.world.bind("eq_active")
         strength = self.world.expand("actuator_forcerange")[:, :, 1] / self.model.actuator_forcerange[:, 1]
-        return np.concatenate([locked, strength, self._friction[:, 0, :1]], axis=1).astype(np.float32)
+        return np.concatenate([locked, strength, self._friction[:, 0, :1]], axis=1, dtype=np.float32)

@@ -1,4 +1,8 @@
-"""Noise on the scandots, for tests (section IV-B of the paper). What MLP and RMA are trained with is in baselines.py.
+"""Scandots: the 16 x 12 points around the robot at which it is told the height of the ground; and what can be wrong with
+them (section IV-B of the paper). What MLP and RMA are trained with is in baselines.py.
+
+The grid lies level, turns with the robot's yaw and has its trunk in the middle. Transformers read it as 4 x 3 patches of
+4 x 4 points: the paper has 12 patches; their size is ours, the spacing and the scale of the heights are legged_gym's.
 
     low frequency   k of the 12 patches are each "offset as a whole by a distance in random directions"
     high frequency  every point is "shifted vertically and laterally with Gaussian noise independently"
@@ -7,18 +11,23 @@
 A shift is three-dimensional. Its lateral part moves the point at which the ground is read, so it acts before the
 terrain is looked up: beside an edge it matters, on flat ground it does not. Its vertical part adds to the height.
 
-Pure functions with an explicit generator. Legend: n robots, 16 x 12 points forward x left, 12 patches of 4 x 4.
-
-    python noise.py             # draws clean and noisy scans of stairs to results/noise.png
+Legend: n robots; 16 points forward (row 0 is the rearmost), 12 to the left (column 0 is the rightmost); 12 patches.
 """
 
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
-from scandots import HEIGHT_SCALE, NUM_PATCHES, PATCH, SCAN_SHAPE, scan
 from terrain import Terrain
+
+SCAN_SHAPE = (16, 12)  # points forward, left
+SPACING = 0.1  # m, legged_gym
+PATCH = 4  # points a side
+NUM_PATCHES = SCAN_SHAPE[0] // PATCH * (SCAN_SHAPE[1] // PATCH)
+HEIGHT_SCALE = 5.0  # legged_gym
+
+AXES = ((np.arange(n) - (n - 1) / 2) * SPACING for n in SCAN_SHAPE)
+FORWARD, LEFT = np.meshgrid(*AXES, indexing="ij")  # (16, 12) m, of each point from the trunk
 
 
 @dataclass(frozen=True)
@@ -38,7 +47,7 @@ class ScanNoise:
             raise ValueError("the scale of noise is a number from 0 on")
 
     def __str__(self) -> str:
-        """What `parse` reads back (but for `offset_patches` and `redraw`), e.g. 'offset:0.2+missing:4'."""
+        """What `parse` reads back (but for `offset_patches` and `redraw`)."""
         words = {"offset": self.offset, "missing": self.missing_patches, "sigma": self.sigma}
         return "+".join(f"{name}:{value}" for name, value in words.items() if value) or "clean"
 
@@ -62,7 +71,32 @@ def parse(text: str) -> ScanNoise:
                     raise ValueError("no such kind of noise")
         return ScanNoise(**values)
     except ValueError as error:
-        raise ValueError(f"cannot read the noise {text!r} ({error}); write clean, offset:0.3, sigma:0.1 or missing:4") from None
+        words = "write clean, offset:0.3, sigma:0.1 or missing:4"
+        raise ValueError(f"cannot read the noise {text!r} ({error}); {words}") from None
+
+
+def scan(terrain: Terrain | None, position: np.ndarray, yaw: np.ndarray, shift: np.ndarray | None = None) -> np.ndarray:
+    """(n, 16, 12) float32: 5 clip(trunk z - 0.5 m - ground z, -1, 1) at every point.
+
+    position (n, 3) m and yaw (n,) rad of the trunk; terrain None is flat ground. shift (n, 16, 12, 3) m, in the grid's
+    axes: how far off each point is from where the robot believes it.
+    """
+    forward, left, up = FORWARD, LEFT, 0.0
+    if shift is not None:
+        forward, left, up = FORWARD + shift[..., 0], LEFT + shift[..., 1], shift[..., 2]
+    ground = np.zeros((len(yaw), *SCAN_SHAPE))
+    if terrain is not None:
+        cos, sin = np.cos(yaw)[:, None, None], np.sin(yaw)[:, None, None]
+        x, y = position[:, 0, None, None], position[:, 1, None, None]
+        ground = terrain.height(x + cos * forward - sin * left, y + sin * forward + cos * left)
+    height = position[:, 2, None, None] - 0.5 - (ground + up)
+    return (HEIGHT_SCALE * np.clip(height, -1, 1)).astype(np.float32)
+
+
+def as_patches(points: np.ndarray) -> np.ndarray:
+    """(16, 12) -> (12, 16): the points of each patch, in ROLT's order, row by row."""
+    rows, columns = (size // PATCH for size in SCAN_SHAPE)
+    return points.reshape(rows, PATCH, columns, PATCH).swapaxes(1, 2).reshape(NUM_PATCHES, PATCH**2)
 
 
 def spread(patches: np.ndarray) -> np.ndarray:
@@ -99,7 +133,7 @@ class NoisyScan:
 
     def __init__(self, num_envs: int, terrain: Terrain | None, noise: ScanNoise, seed: int | tuple[int, ...]):
         self.terrain, self.noise = terrain, noise
-        self.rng = np.random.default_rng((*np.atleast_1d(seed), 1))  # not the numbers that the env draws from its own seed
+        self.rng = np.random.default_rng((*np.atleast_1d(seed), 1))  # not the numbers that the env draws from its seed
         self.shift = np.zeros((num_envs, *SCAN_SHAPE, 3))  # m, of the patches
         self.missing = np.zeros((num_envs, *SCAN_SHAPE), dtype=bool)
 
@@ -117,32 +151,12 @@ class NoisyScan:
             self.missing[ids] = missing_points(self.noise, len(ids), self.rng)
 
     def read(self, ids: np.ndarray, position: np.ndarray, yaw: np.ndarray) -> np.ndarray:
-        """(n, 16, 12) float32 scaled heights for the n robots `ids`, whose trunks are at position (n, 3) m, yaw (n,) rad."""
+        """(n, 16, 12) float32 scaled heights for the n robots `ids`, trunks at position (n, 3) m and yaw (n,) rad."""
         if self.noise == ScanNoise():
             return scan(self.terrain, position, yaw)
         if self.noise.redraw:
             self.draw(ids)
-        heights = scan(self.terrain, position, yaw, self.shift[ids] + point_shifts(self.noise, len(ids), self.rng))
+        shift = self.shift[ids] + point_shifts(self.noise, len(ids), self.rng)
+        heights = scan(self.terrain, position, yaw, shift)
         heights[self.missing[ids]] = 0.0
         return heights
-
-
-def main() -> None:
-    from plots import scans  # not above: training needs no matplotlib for its noise
-
-    stairs, rng = Terrain(("stairs",), (3,)), np.random.default_rng(0)
-    position, yaw = np.array([[1.4, 0.0, 0.6]]), np.zeros(1)  # where a robot stands on the third step
-    low, high = ScanNoise(offset=0.3), ScanNoise(sigma=0.1)
-    panels = {
-        "clean": scan(stairs, position, yaw),
-        "low frequency\n4 patches by 0.3 m": scan(stairs, position, yaw, patch_shifts(low, 1, rng)),
-        "high frequency\nsigma 0.1 m": scan(stairs, position, yaw, point_shifts(high, 1, rng)),
-    }
-    missing = np.where(missing_points(ScanNoise(missing_patches=4), 1, rng), 0, panels["clean"])
-    panels = {name: heights[0] / HEIGHT_SCALE for name, heights in (panels | {"4 patches missing": missing}).items()}
-    scans(panels, Path(__file__).parent / "results" / "noise.png", "Trunk height - 0.5 m - ground [m]; forward is up")
-    print("written: results/noise.png")
-
-
-if __name__ == "__main__":
-    main()

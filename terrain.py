@@ -12,13 +12,10 @@ Heights grow with the level (legged_gym's formulas, whose curriculum goes from l
 for a policy that comes from flat ground and hardly lifts its feet). Unlike legged_gym's, the ground is not
 a height field but boxes and convex meshes: a height field costs four times as much to collide with, and its steps are
 never quite vertical. All coordinates in metres. Walking robots climb the levels as in legged_gym (`next_row`).
-
-    python terrain.py           # draws the training map to results/terrain.png
 """
 
 from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path
 
 import mujoco
 import numpy as np
@@ -113,14 +110,14 @@ class Terrain:
                         if top > 0:
                             _add_box(spec, x + centres[i], y + centres[j], BLOCK / 2, top)
 
-    def next_row(self, row: np.ndarray, distance: np.ndarray, speed: np.ndarray, seconds: float, rng) -> np.ndarray:
+    def next_row(self, row: np.ndarray, distance: np.ndarray, commanded: np.ndarray, rng) -> np.ndarray:
         """legged_gym's curriculum, at the end of an episode: up a level after half a tile, down after less than half of the
         commanded distance; after the last level, any.
 
-        row (n,), distance (n,) m from the start, speed (n,) m/s commanded, seconds: of a whole episode.
+        row (n,), distance (n,) m from the start, commanded (n,) m in a whole episode.
         """
         up = distance > TILE / 2
-        down = ~up & (distance < 0.5 * speed * seconds)
+        down = ~up & (distance < 0.5 * commanded)
         row = np.maximum(row + up.astype(int) - down, 0)
         finished = row >= len(self.levels)
         return np.where(finished, rng.integers(len(self.levels), size=len(row)), row)
@@ -148,17 +145,3 @@ def _add_frustum(spec: mujoco.MjSpec, x: float, y: float, top: float, name: str)
     mesh = spec.add_mesh(name=name)
     mesh.uservert = vertices.ravel()
     spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=name, pos=[x, y, 0], rgba=_SHADES[0], **_SOLID)
-
-
-def main() -> None:
-    from plots import ground_map  # not above: nothing else here draws
-
-    x, y = np.arange(-1, 58, 0.05), np.arange(-5, 38, 0.05)
-    height = TRAINING_MAP.height(*np.meshgrid(x, y, indexing="ij"))
-    title = "The training map: " + ", ".join(TRAINING_MAP.columns) + " (from right to left)"
-    ground_map(height, (x[0], x[-1], y[0], y[-1]), Path(__file__).parent / "results" / "terrain.png", title)
-    print("written: results/terrain.png")
-
-
-if __name__ == "__main__":
-    main()

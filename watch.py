@@ -1,9 +1,10 @@
-"""A trained policy to look at while it walks, with its fault, its command and its noise to change on the way.
+"""A trained policy to look at while it walks, with its fault, its command and its noise to change on the way; and films.
 
     python evaluate.py watch                                          # the A1, healthy
     python evaluate.py watch --robot a1 --fault lock:FR_calf --speed 0.5
     python evaluate.py watch --stairs 0 --noise offset:0.2            # steps of 5 cm (level 0), and scandots that lie
-    python evaluate.py watch --fault tow:RR --video tow.gif           # no viewer, a moving picture
+    python evaluate.py watch --fault tow:RR --out tow.gif             # no viewer, a moving picture
+    python evaluate.py watch --fault healthy lock:FR_calf --out strip.png    # a row of frames a fault
 
 Where there is a display, a window of MuJoCo's viewer opens: the keys up and down change the speed, left and right the
 fault. Elsewhere MuJoCo's browser viewer is served; its panel does the same. (It is open to everybody who can reach the
@@ -12,86 +13,155 @@ port; from another machine it wants `ssh -L 8080:localhost:8080`.) Either way th
 falls starts over by itself.
 """
 
+import argparse
+import copy
 import os
 import queue
 import re
 import sys
 import threading
 import time
-import warnings
-from functools import partial
 from pathlib import Path
 
-import render  # first: it says how to draw without a display, which mujoco reads when it is imported
 import mujoco
 import numpy as np
 import torch
+from PIL import Image, ImageDraw
 
-from checkpoint import CheckpointError, load_policy
-from cli import Parser, fail, port, positive, seed, writable_folder
+from checkpoint import load_policy
 from env import CONTROL_DT, LocomotionEnv
-from faults import REAL_WORLD, TASKS, Fault, first_task, healthy, parse, props, write_fault
+from faults import REAL_WORLD, TASKS, Fault, first_task, healthy, joint_mask, parse, props, write_fault
 from noise import ScanNoise
 from noise import parse as parse_noise
-from ppo import to_tensors
-from protocol import straight_ahead
 from robots import ROBOTS
 from terrain import Terrain
+from walk import Walk, straight_ahead, take_a_walk, to_tensors
 
-MAX_COMMAND = 10.0  # m/s, ours: ten times what training commands
 HELP = "type a fault (lock:RL_calf, healthy, ...), a speed (0.5), noise (sigma:0.1, clean, ...), again or quit"
+NO_DISPLAY = sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+
+# ---------------------------------------------------------------------- pictures
+
+
+def painted(env: LocomotionEnv, fault: Fault) -> mujoco.MjModel:
+    """A copy of the env's model, the links behind the fault in red."""
+    model = copy.copy(env.model)
+    faulty = (*fault.locked, *(part for part, _ in (*fault.strength, *fault.half_locked)))
+    bodies = [f"{leg}_wheel" for leg in fault.skating]
+    bodies += [name for name, bad in zip(env.robot.joints, joint_mask(faulty, env.robot)) if bad]
+    for body in bodies:
+        model.geom_rgba[model.geom_bodyid == model.body(body).id] = [0.85, 0.2, 0.15, 1]
+    return model
+
+
+def draw(walk: Walk, robot: int, steps: range, width: int = 480, height: int = 300) -> list[Image.Image]:
+    """Frames of one of the robots at these steps. RuntimeError with the way out where nothing can be drawn."""
+    if NO_DISPLAY and "MUJOCO_GL" not in os.environ:  # MuJoCo would look for a window
+        from mujoco.egl import GLContext
+        from mujoco.rendering.classic import gl_context
+
+        gl_context.GLContext = GLContext
+    model = painted(walk.env, walk.faults[robot])
+    try:
+        renderer = mujoco.Renderer(model, height, width)
+    except Exception as error:  # each backend fails in its own way
+        raise RuntimeError(f"cannot draw ({error}): try MUJOCO_GL=egl (libegl1) or osmesa (libosmesa6)") from error
+    data, camera, frames = mujoco.MjData(model), mujoco.MjvCamera(), []
+    camera.distance = 1.3 * max(1.0, walk.env.robot.trunk_box[0] / 0.38)  # m, the whole robot
+    camera.azimuth, camera.elevation = 60 if walk.env.terrain else 125, -18  # from behind, stairs show their steps
+    for step in steps:
+        data.qpos[:] = walk.poses[step, robot]
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_camlight(model, data)
+        mujoco.mj_tendon(model, data)
+        camera.lookat[:] = data.qpos[:3] - [0, 0, 0.08]  # on flat ground 0.2 m up
+        renderer.update_scene(data, camera)
+        frames.append(Image.fromarray(renderer.render()))
+    renderer.close()
+    return frames
+
+
+def write_gif(frames: list[Image.Image], path: Path, seconds_a_frame: float) -> None:
+    """One palette for all frames keeps the file small and the colours still."""
+    palette = frames[0].quantize(64, Image.Quantize.FASTOCTREE)  # keeps the few red pixels of a fault red
+    images = [frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]
+    duration = max(20, round(1000 * seconds_a_frame))
+    images[0].save(path, save_all=True, append_images=images[1:], duration=duration, loop=0, optimize=True)
+
+
+def write_strip(rows: dict[str, list[Image.Image]], path: Path) -> None:
+    """One row of frames a film, from left to right, its name in the first one."""
+    width, height = next(iter(rows.values()))[0].size
+    strip = Image.new("RGB", (max(map(len, rows.values())) * width, len(rows) * height), "white")
+    for y, (name, frames) in enumerate(rows.items()):
+        for x, frame in enumerate(frames):
+            strip.paste(frame, (x * width, y * height))
+        ImageDraw.Draw(strip).text((8, y * height + 6), name, fill="black", font_size=20)
+    strip.save(path)
+
+
+def film(args, policy, faults: list[Fault], options: dict) -> None:
+    """Writes --out: from 2 s on, up to the first fall."""
+    seconds, start = args.seconds or (4.0 if args.out.suffix == ".gif" else 0.6), round(2 / CONTROL_DT)
+    walk = take_a_walk(policy, args.robot, faults, args.speed, 2 + seconds, args.seed, **options)
+    every = 2 if args.out.suffix == ".gif" else max(1, round(seconds / CONTROL_DT / 6))  # six frames in a strip
+    shown = {str(fault): range(start, walk.steps[i], every) for i, fault in enumerate(faults)}
+    if fallen := [name for name, steps in shown.items() if not steps]:
+        raise RuntimeError(f"with {fallen[0]} the robot falls within 2 s: there is nothing to show")
+    if args.out.suffix == ".gif":
+        write_gif(draw(walk, 0, shown[str(faults[0])]), args.out, every * CONTROL_DT)
+    else:
+        write_strip({name: draw(walk, i, steps, 300, 240) for i, (name, steps) in enumerate(shown.items())}, args.out)
+    print(f"written: {args.out}")
+
+
+# ---------------------------------------------------------------------- live
 
 
 class Show:
-    """One robot that walks straight on for ever. `model` and `data` are what a viewer shows; they are new objects after some
-    changes. `said` is the answer to the last wish."""
+    """One robot that walks straight on for ever. `model` and `data` are what a viewer shows; they are new objects after
+    some changes. `said` is the answer to the last word."""
 
-    def __init__(
-        self, policy, robot: str, fault: Fault = healthy(), speed: float = 0.75, seed: int = 0,
-        terrain: Terrain | None = None, noise: ScanNoise = ScanNoise(),
-    ):  # fmt: skip
+    def __init__(self, policy, robot: str, fault: Fault, speed: float, seed: int, terrain: Terrain | None, noise: ScanNoise):
         self.policy, self.robot, self.speed, self.seed = policy, robot, speed, seed
         self.terrain, self.noise = terrain, noise
         task = TASKS[first_task(robot)]
         self.menu = [fault for _, fault in task.training] + list(task.unseen)
         self.menu += [fault for fault in REAL_WORLD.values() if "go1" in task.robots and fault not in self.menu]
-        self.wishes, self.said, self.over = queue.Queue(), HELP, False
+        self.words, self.said, self.over = queue.Queue(), HELP, False
         self.start(fault)
 
     def start(self, fault: Fault) -> None:
         """A new episode in a new env. ValueError if the robot has no such part; then all stays as it was."""
+        config = straight_ahead(self.policy, self.speed, 3600)
         options = {"extras": self.policy.extras, "terrain": self.terrain, "noise": self.noise}
-        options["config"] = straight_ahead(self.speed, 3600)
-        env = LocomotionEnv(self.robot, 1, self.seed, 1, [(1.0, fault)], **options)
-        observation, model = env.reset(), render.painted(env, fault)
+        env = LocomotionEnv(self.robot, 1, self.seed, 1, [(1.0, fault)], config, **options)
+        observation, model = env.reset(), painted(env, fault)
         self.env, self.observation, self.fault = env, observation, fault
         self.model, self.data = model, mujoco.MjData(model)
 
     def set_fault(self, fault: Fault) -> None:
         """Without a fall or a reset, unless a box or wheels come or go. ValueError if the robot has no such part."""
-        if props([fault]) == props([self.fault]):
-            write_fault(fault, self.env.robot, self.env.world, np.array([0]))
-            self.env.pin_faults([fault])  # at the next resets, too
-            self.fault, self.model = fault, render.painted(self.env, fault)
-        else:
-            self.start(fault)
+        if props([fault]) != props([self.fault]):
+            return self.start(fault)
+        write_fault(fault, self.env.robot, self.env.world, np.array([0]))
+        self.env.pin_faults([fault])  # at the next resets, too
+        self.fault, self.model = fault, painted(self.env, fault)
 
-    def obey(self, wish: str) -> None:
+    def hear(self, word: str) -> None:
         """One of the words that HELP lists. What it cannot read changes nothing, and `said` tells why."""
         try:
-            if wish == "quit":
+            if word == "quit":
                 self.over = True
-            elif wish == "again":
+            elif word == "again":
                 self.start(self.fault)
-            elif wish.replace(".", "", 1).isdecimal():
-                if float(wish) > MAX_COMMAND:
-                    raise ValueError(f"a speed is at most {MAX_COMMAND:g} m/s, not {wish}")
-                self.speed = float(wish)
-            elif re.split("[:+]", wish)[0] in ("clean", "offset", "sigma", "missing"):
-                self.noise = parse_noise(wish)
+            elif word.replace(".", "", 1).isdecimal():
+                self.speed = min(3.0, float(word))  # m/s, ours: three times what training commands
+            elif re.split("[:+]", word)[0] in ("clean", "offset", "sigma", "missing"):
+                self.noise = parse_noise(word)
                 self.env.scan.set_noise(self.noise)
-            elif wish:
-                self.set_fault(parse(wish))
+            elif word:
+                self.set_fault(parse(word))
             self.said = f"{self.fault}, {self.speed:g} m/s, scandots {self.noise}"
         except ValueError as error:
             self.said = str(error)
@@ -99,11 +169,11 @@ class Show:
 
     @torch.no_grad()
     def step(self) -> None:
-        """Wishes, and one control step of 20 ms."""
-        while not self.wishes.empty():
-            self.obey(self.wishes.get().strip())
+        """Words, and one control step of 20 ms."""
+        while not self.words.empty():
+            self.hear(self.words.get().strip())
         self.env.command[:, 0] = self.speed
-        action = self.policy(to_tensors(self.observation, "cpu")).numpy()
+        action = self.policy(to_tensors(self.observation)).numpy()
         self.observation, _, fallen, _, _ = self.env.step(action)
         if fallen[0]:
             print("it fell and starts over", flush=True)
@@ -123,39 +193,21 @@ class Clock:
         time.sleep(max(0.0, self.due - now))
 
 
-def listen(show: Show) -> None:
-    """Lines typed in the terminal are wishes."""
-    threading.Thread(target=lambda: [show.wishes.put(line) for line in sys.stdin], daemon=True).start()
-
-
-def has_display() -> bool:
-    """Can a window be opened? On Linux, where mujoco.viewer would end the program if not, it is tried."""
-    if sys.platform != "linux":
-        return True
-    if not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
-        return False
-    import glfw  # mujoco brings it along
-
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        return bool(glfw.init())
-
-
 def desktop(show: Show) -> None:
     """A window of mujoco.viewer, opened anew when a box or wheels come or go. Closing it ends the show."""
     import mujoco.viewer
 
     def key(code: int) -> None:  # GLFW's codes
         if code in (265, 264):  # up, down
-            show.wishes.put(f"{max(0.0, show.speed + (0.1 if code == 265 else -0.1)):.2f}")
+            show.words.put(f"{max(0.0, show.speed + (0.1 if code == 265 else -0.1)):.2f}")
         if code in (262, 263):  # right, left
             here = show.menu.index(show.fault) if show.fault in show.menu else 0
-            show.wishes.put(str(show.menu[(here + (1 if code == 262 else -1)) % len(show.menu)]))
+            show.words.put(str(show.menu[(here + (1 if code == 262 else -1)) % len(show.menu)]))
 
-    clock, closed = Clock(), False
+    clock, closed, panels = Clock(), False, {"show_left_ui": False, "show_right_ui": False}
     while not (show.over or closed):
         model, data = show.model, show.data
-        with mujoco.viewer.launch_passive(model, data, key_callback=key, show_left_ui=False, show_right_ui=False) as viewer:
+        with mujoco.viewer.launch_passive(model, data, key_callback=key, **panels) as viewer:
             viewer.sync()  # a camera that is set before the first one is set back
             with viewer.lock():
                 track(viewer.cam)
@@ -169,15 +221,15 @@ def desktop(show: Show) -> None:
                 closed = not viewer.is_running()
 
 
-def browser(show: Show, http_port: int = 0) -> None:
-    """MuJoCo's viewer as a web page, with a panel of our own. `http_port` 0: the first free one from 8080 on."""
+def browser(show: Show, port: int) -> None:
+    """MuJoCo's viewer as a web page, with a panel of our own. port 0: the first free one from 8080 on."""
     from mujoco.studio import launch_web, messages, plugin, viewer_protocol
     from mujoco.studio.dear_imgui import dear_imgui as imgui
 
     names = [str(fault) for fault in show.menu]
 
     class Panel(plugin.ViewerPlugin):
-        """Runs in the viewer's thread, so it only reads the show and puts wishes in its queue."""
+        """Runs in the viewer's thread, so it only reads the show and puts words in its queue."""
 
         text = str(show.fault)
 
@@ -193,19 +245,20 @@ def browser(show: Show, http_port: int = 0) -> None:
                 imgui.TextWrapped(show.said)
                 moved, speed = imgui.SliderFloat("m/s", show.speed, 0.0, 1.0, "%.2f")
                 if moved:
-                    show.wishes.put(f"{speed:.2f}")
-                chosen, index = imgui.Combo("fault", names.index(str(show.fault)) if str(show.fault) in names else -1, names)
+                    show.words.put(f"{speed:.2f}")
+                here = names.index(str(show.fault)) if str(show.fault) in names else -1
+                chosen, index = imgui.Combo("fault", here, names)
                 if chosen:
-                    show.wishes.put(names[index])
+                    show.words.put(names[index])
                 _, self.text = imgui.InputText("or write one", self.text)
                 if imgui.Button("set it"):
-                    show.wishes.put(self.text)
+                    show.words.put(self.text)
                 imgui.SameLine()
                 if imgui.Button("again"):
-                    show.wishes.put("again")
+                    show.words.put("again")
             imgui.End()
 
-    config, clock = viewer_protocol.ViewerConfig(title=f"ROLT: {show.robot}", gfx="web", http_port=http_port), Clock()
+    config, clock = viewer_protocol.ViewerConfig(title=f"ROLT: {show.robot}", gfx="web", http_port=port), Clock()
     with launch_web.launch(config, plugins=[Panel()]) as handle:
         while handle.is_running() and not show.over:
             show.step()
@@ -219,46 +272,42 @@ def track(camera) -> None:
 
 
 def main(argv: list[str] | None = None) -> None:
-    parser = Parser(__doc__)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter, usage=argparse.SUPPRESS
+    )
     parser.add_argument("--robot", default="a1", choices=ROBOTS)
     parser.add_argument("--checkpoint", type=Path, metavar="FILE", help="default: the shipped ROLT of the robot")
-    parser.add_argument("--fault", default="healthy", help="e.g. lock:FR_calf+weaken:RL:0.5 (default healthy)")
-    parser.add_argument("--speed", type=partial(positive, most=MAX_COMMAND), default=0.75, help="commanded, m/s (default 0.75)")
+    parser.add_argument("--fault", nargs="+", default=["healthy"], help="e.g. lock:FR_calf+weaken:RL:0.5; .png shows several")
+    parser.add_argument("--speed", type=float, default=0.75, help="commanded, m/s (default 0.75)")
     parser.add_argument("--stairs", type=int, choices=range(-2, 11), metavar="LEVEL", help="-2 to 10, instead of flat ground")
     parser.add_argument("--noise", default="clean", help="on the scandots, e.g. offset:0.2, sigma:0.1, missing:4")
-    parser.add_argument("--seed", type=seed, default=0)
+    parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--viewer", choices=("desktop", "browser"), help="default: desktop where there is a display")
-    parser.add_argument("--port", type=port, default=0, help="of the browser viewer (default: the first free from 8080 on)")
-    parser.add_argument("--video", type=Path, metavar="FILE.gif", help="write a moving picture instead")
-    parser.add_argument("--seconds", type=partial(positive, most=120), default=4.0, help="of the moving picture (default 4)")
+    parser.add_argument("--port", type=int, default=0, help="of the browser viewer (default: the first free from 8080 on)")
+    parser.add_argument("--out", type=Path, metavar="FILE", help="write a moving picture (.gif) or a strip of frames (.png)")
+    parser.add_argument("--seconds", type=float, help="of the picture (default 4, of a strip 0.6)")
     args = parser.parse_args(argv)
-    if args.video and args.video.suffix != ".gif":
-        fail(f"--video is a .gif file, not {args.video}")
+    if args.out and args.out.suffix not in (".gif", ".png"):
+        parser.error(f"--out is a .gif or a .png file, not {args.out}")
+    if len(args.fault) > 1 and not (args.out and args.out.suffix == ".png"):
+        parser.error("one fault at a time; several make the rows of a --out FILE.png")
     torch.set_num_threads(1)
     try:
         task = first_task(args.robot) if args.stairs is None else "terrain"
-        shipped = Path(os.path.relpath(Path(__file__).parent / "checkpoints")) / f"{args.robot}-{task}-rolt.pt"
+        shipped = Path(os.path.relpath(Path(__file__).parent)) / f"checkpoints/{args.robot}-{task}-rolt.pt"
         policy, _ = load_policy(args.checkpoint or shipped, args.robot)
-        fault, noise = parse(args.fault), parse_noise(args.noise)
+        faults, noise = [parse(text) for text in args.fault], parse_noise(args.noise)
         terrain = None if args.stairs is None else Terrain(("stairs",), (args.stairs,) * 9)
-        if args.video:
-            writable_folder(args.video.parent, "--video")
-            options = {"speed": args.speed, "seed": args.seed, "terrain": terrain, "noise": noise}
-            frames = render.film(policy, args.robot, fault, args.seconds, 2, **options)
-            render.write_gif(frames, args.video, 2 * CONTROL_DT)
-            print(f"written: {args.video}")
-            return
-        kind = args.viewer or ("desktop" if has_display() else "browser")
-        if kind == "desktop" and not has_display():
-            fail("no window can be opened: set DISPLAY to a screen that is there, or use --viewer browser")
-        show = Show(policy, args.robot, fault, args.speed, args.seed, terrain, noise)
+        if args.out:
+            return film(args, policy, faults, {"terrain": terrain, "noise": noise})
+        show = Show(policy, args.robot, faults[0], args.speed, args.seed, terrain, noise)
         print(HELP)
-        listen(show)
-        desktop(show) if kind == "desktop" else browser(show, args.port)
+        threading.Thread(target=lambda: [show.words.put(line) for line in sys.stdin], daemon=True).start()
+        browser(show, args.port) if args.viewer == "browser" or NO_DISPLAY else desktop(show)
     except KeyboardInterrupt:
         pass
-    except (CheckpointError, ValueError, RuntimeError, ImportError, OSError, FloatingPointError) as error:
-        fail(error)
+    except (ValueError, RuntimeError, ImportError, OSError, FloatingPointError) as error:
+        sys.exit(f"error: {error}")
 
 
 if __name__ == "__main__":

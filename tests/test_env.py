@@ -30,8 +30,8 @@ def test_bit_identical_for_a_seed_at_any_number_of_threads():
 @pytest.mark.parametrize(
     "change, says",
     [
-        ({"friction": (1.25, 0.5)}, "friction is"), ({"friction": (0.0, 1.0)}, "friction is above 0"),
-        ({"heading": (0.0, np.nan)}, "heading is"), ({"push_speed": -1.0}, "push_speed is -1.0"), ({"start_rows": 0}, "at least 1 row"),
+        ({"friction": (1.25, 0.5)}, "friction is"), 
+        ({"heading": (0.0, np.nan)}, "heading is"), ({"push_speed": -1.0}, "push_speed is -1.0"),
         ({"push_seconds": 0.0}, "a control step already lasts 0.02 s"), ({"episode_seconds": np.inf}, "episode_seconds is inf"),
     ],
 )  # fmt: skip
@@ -46,7 +46,7 @@ def test_steps_that_make_no_sense_are_refused():
         env.step(np.zeros((4, 12)))
     env.reset()
     for shape in ((12, 4), (48,), (4, 3, 4)):
-        with pytest.raises(ValueError, match=r"actions are \(4, 12\) for these robots, not"):
+        with pytest.raises(ValueError, match=r"actions are \(4, 12\), not"):
             env.step(np.zeros(shape))
     env.step(np.zeros((4, 4, 3)))
 
@@ -76,19 +76,19 @@ def test_history_rolls_oldest_first_and_starts_filled():
     assert first.shape == (3, 4, 10, 21)
     assert np.array_equal(first, np.repeat(first[:, :, :1], 10, axis=2))
     rng, before = np.random.default_rng(0), first
+    mirrored = np.array([[1, 1, 1], [-1, 1, 1]] * 2)  # hips of left legs
     for _ in range(12):
         action = rng.normal(size=(3, 12))
         after, *_ = env.step(action)
         assert np.array_equal(after.legs[:, :, :-1], before[:, :, 1:])
-        target = np.array(A1.default_pose) + A1.action_scale * action.reshape(3, 4, 3)
-        assert np.allclose(after.legs[:, :, -1, 6:9], target)  # the leg's own previous target
-        assert np.allclose(after.action, target.reshape(3, 12))
-        assert np.allclose(after.legs[:, :, -1, 0:3], np.array(A1.default_pose) + env.joint_error)
-        assert np.allclose(after.legs[:, :, -1, 3:6], 0.05 * env.joint_velocity)
-        assert np.allclose(after.legs[:, 2, -1, 9:12], env.command * (2, 2, 0.25)) and env.command[:, 0].any()
+        assert np.allclose(after.legs[:, :, -1, 6:9], action.reshape(3, 4, 3))  # the leg's own previous action
+        assert np.allclose(after.action, action)
+        assert np.allclose(after.legs[:, :, -1, 0:3], 4 * mirrored * env.joint_error)
+        assert np.allclose(after.legs[:, :, -1, 3:6], 0.2 * mirrored * env.joint_velocity)
+        assert np.allclose(after.legs[:, 2, -1, 9:12], 2 * env.command) and env.command[:, 0].any()
         assert np.allclose(after.legs[:, 2, -1, 12:15], 2 * env.linear_velocity) and env.linear_velocity.any()
-        assert np.allclose(after.legs[:, 2, -1, 15:18], 0.25 * env.angular_velocity) and env.angular_velocity.any()
-        assert np.allclose(after.legs[:, 2, -1, 18:21], env.gravity)
+        assert np.allclose(after.legs[:, 2, -1, 15:18], env.angular_velocity) and env.angular_velocity.any()
+        assert np.allclose(after.legs[:, 2, -1, 18:21], 5 * (env.gravity + (0, 0, 1)), atol=1e-6)
         before = after.legs
 
 
@@ -129,7 +129,7 @@ def test_body_velocities_and_gravity_are_in_the_trunks_frame():
 
 
 def test_scan_of_flat_ground_is_the_trunks_height():
-    env = LocomotionEnv("a1", 2, num_threads=1)
+    env = LocomotionEnv("a1", 2, num_threads=1, extras=("heights",))
     heights = env.reset().heights
     assert heights.shape == (2, 16, 12)
     assert np.allclose(heights, 5 * (0.42 - 0.5))  # every reset starts at 0.42 m
@@ -282,7 +282,7 @@ def test_diverged_simulation_is_ended_counted_and_harms_nobody(tmp_path, monkeyp
     observation, reward, terminated, _, info = env.step(np.zeros((3, 12)))
     expected, *_ = twin.step(np.zeros((3, 12)))
     assert info["diverged"].tolist() == [False, True, False] == terminated.tolist()
-    assert env.divergences == 1 and reward[1] == 0
+    assert reward[1] == 0
     assert all(np.isfinite(field).all() for field in observation) and np.isfinite(reward).all()
     assert np.array_equal(observation.legs[[0, 2]], expected.legs[[0, 2]])
     _, _, terminated, _, info = env.step(np.zeros((3, 12)))
@@ -304,7 +304,7 @@ def test_a_state_that_runs_away_in_the_last_substep_is_noticed_at_once(value, mo
     monkeypatch.setattr(env.world, "step", run_away)
     observation, reward, terminated, _, info = env.step(np.zeros((3, 12)))
     expected, *_ = twin.step(np.zeros((3, 12)))
-    assert info["diverged"].tolist() == [False, True, False] == terminated.tolist() and env.divergences == 1
+    assert info["diverged"].tolist() == [False, True, False] == terminated.tolist()
     for x in (*observation, *info["final_observation"], *info["rewards"].values(), reward, info["speed"], info["position"]):
         assert (np.abs(x) < 1000).all()
     assert reward[1] == 0 and info["episode_returns"].tolist() == [0]
