@@ -181,13 +181,13 @@ def gaits(args, policies) -> None:
         for k, case in enumerate(cases):
             found = [gait(walk, k * args.episodes + i) for i in range(args.episodes)]
             found = [one for one in found if one is not None]
-            if found:
-                duty, stride, feet = (np.mean([one[name] for one in found], axis=0) for name in found[0])
-                words = "".join(f"{share:6.2f}" for share in duty)
-                print(f"{case:24}{feet:11.2f}{stride.mean():11.2f}{duty.mean():8.2f}{words}  {len(found)} of {args.episodes}")
-                for leg, share, hz in zip(legs, duty, stride):
-                    row = {"method": card["policy"], "seed": card["seed"], "checkpoint": str(path), "case": case}
-                    rows.append(row | {"leg": leg, "duty": f"{share:.3f}", "stride_hz": f"{hz:.3f}"})
+            found = found or [dict.fromkeys(("duty", "stride_hz", "feet_down"), np.full(len(legs), np.nan))]
+            duty, stride, feet = (np.mean([one[name] for one in found], axis=0) for name in found[0])
+            words = "".join(f"{share:6.2f}" for share in duty)
+            print(f"{case:24}{feet.mean():11.2f}{stride.mean():11.2f}{duty.mean():8.2f}{words}")
+            for leg, share, hz in zip(legs, duty, stride):
+                row = {"method": card["policy"], "seed": card["seed"], "checkpoint": str(path), "case": case}
+                rows.append(row | {"leg": leg, "duty": f"{share:.3f}", "stride_hz": f"{hz:.3f}"})
             end = walk.steps[k * args.episodes]
             shown = walk.contacts[max(0, end - round(1 / CONTROL_DT)) : end, k * args.episodes]
             panels.append((f"{card['policy']}, {case}", shown))

@@ -138,7 +138,7 @@ class ROLT(nn.Module):
         self.leg_embedding = nn.Sequential(nn.Linear(config.history * frame, D), nn.ReLU(), nn.Linear(D, D))
         if config.identity == "embedding":
             self.leg_position = nn.Parameter(config.leg_position_std * torch.randn(num_legs, D))
-        else:
+        if config.identity == "action":
             self.action_embedding = nn.Linear(num_legs * num_joints, D)
         if config.scan:
             self.patch_embedding = nn.Linear(config.patch**2, D)
@@ -181,11 +181,9 @@ class ROLT(nn.Module):
         """E_0 = [e^prop, e^h], (B, T, D)."""
         config = self.config
         legs = self.leg_embedding(observation.legs.flatten(2))  # (B, L, H*frame) -> (B, L, D), eq. 1
-        if config.identity == "embedding":
-            tokens = [legs + self.leg_position]
-        else:
-            action = observation.action if config.identity == "action" else torch.zeros_like(observation.action)
-            tokens = [legs, self.action_embedding(action)[:, None]]  # (B, L+1, D), eq. 2 and 3
+        tokens = [legs + self.leg_position if config.identity == "embedding" else legs]
+        if config.identity == "action":
+            tokens.append(self.action_embedding(observation.action)[:, None])  # (B, L+1, D), eq. 2 and 3
 
         if config.scan:
             rows, columns = (size // config.patch for size in config.scan_shape)
@@ -201,7 +199,7 @@ class ROLT(nn.Module):
         """How many tokens a layer updates: all that the next one reads; after the last only the legs are read."""
         if layer == self.config.layers - 1:
             return self.num_legs
-        return self.num_legs + (self.config.identity != "embedding") + self.config.num_patches
+        return self.num_legs + (self.config.identity == "action") + self.config.num_patches
 
     def _encode(self, observation, masks: Masks) -> tuple[Tensor, list[Tensor]]:
         """The leg tokens after the last layer (B, L, D), and the attention weights of every layer."""

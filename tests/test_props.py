@@ -6,8 +6,6 @@ import mujoco
 import numpy as np
 import pytest
 
-import checkpoint
-import evaluate
 from baselines import make_policy
 from env import EnvConfig, LocomotionEnv
 from faults import REAL_WORLD, half_lock, healthy, lock, parse, skate, tow, weaken
@@ -188,20 +186,3 @@ def test_a_box_that_was_not_built_is_refused():
     env.pin_faults([tow("RR")])
     with pytest.raises(ValueError, match="no box or wheel for tow:RR: make the env with this fault"):
         env.reset()
-
-
-def test_the_real_world_test_stands_beside_the_papers(tmp_path, capsys):
-    card = {"robot": "go1", "task": "stiffness", "policy": "rolt", "steps": 0, "seed": 0}
-    checkpoint.save(card | {"weights": make_policy("rolt", GO1).state_dict()}, tmp_path / "policy.pt")
-    policy = ["--checkpoints", str(tmp_path / "policy.pt"), "--out", str(tmp_path)]
-    evaluate.main(["real_world", *policy, "--episodes", "2", "--seconds", "0.1"])
-    with open(tmp_path / "real_world.csv", newline="") as file:
-        rows = list(csv.DictReader(file))
-    assert [row["case"] for row in rows[::2]] == ["healthy", "weaken", "weaken FR", "weaken RR", "weaken RL", "box", "skates"]
-    columns = ("method", "checkpoint", "seed", "case", "episode", "distance_m", "fall_time_s", "episode_return")
-    assert tuple(rows[0]) == columns
-    said = capsys.readouterr().out
-    assert "2.80 ± 0.20" in said and "a physical Go1" in said
-    with pytest.raises(SystemExit):
-        evaluate.main(["real_world", *policy, "--robot", "a1"])
-    assert "was trained on the go1, not on the a1" in capsys.readouterr().err
