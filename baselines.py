@@ -1,4 +1,5 @@
-"""The methods that the paper compares ROLT with (section IV), each whole in one place, and the list of them all.
+"""The methods that the paper compares ROLT with (section IV), each whole in one place, and the list
+of them all.
 
     MLP         all that ROLT sees, flat, into [512, 256, 128]
     Mirrored MLP  (ours) the MLP averaged with its answer to the mirrored state
@@ -6,13 +7,15 @@
     RMA         a base policy that is told what is wrong with the robot, then an adaptation module that guesses it
                 from the past second (Kumar et al. 2021)
     ROAM        a behaviour a training situation, chosen step by step by value functions (Chen et al. 2024)
-    Module PE, No PE Drop, No Feature Drop, and ours, No Leg Frames and No Identity: switches of ROLT (rolt.py)
+    Module PE, No PE Drop, No Feature Drop, and ours, No Leg Frames and No Identity: switches of
+    ROLT (rolt.py)
 
-A policy is a module with forward(observation, masks) -> (B, A) mean action, std() -> (A,), sample_masks(n, generator)
--> {name: (n, ...) bool}, and a few words on itself (`extras` and what follows in ROLT). How it is
-trained is a list of `Stage`s: most have one.
+A policy is a module with forward(observation, masks) -> (B, A) mean action, std() -> (A,),
+sample_masks(n, generator) -> {name: (n, ...) bool}, and a few words on itself (`extras` and what
+follows in ROLT). How it is trained is a list of `Stage`s: most have one.
 
-Legend: B samples, L legs, J joints a leg, A = L*J actions, H = 10 steps of history, K training situations.
+Legend: B samples, L legs, J joints a leg, A = L*J actions, H = 10 steps of history, K training
+situations.
 
     python baselines.py         # parameters and cost of every method
 """
@@ -31,12 +34,13 @@ from rolt import LOG_STD_BOUNDS, ROLT, Decoder, Masks, ROLTConfig, drop
 from noise import HEIGHT_SCALE, SCAN_SHAPE
 
 HIDDEN = (512, 256, 128)  # legged_gym
-# m, standard deviation. The paper adds Gaussian noise in the training of MLP and RMA, without a number; legged_gym's uniform
-# +-0.1 m has this deviation.
+# m, standard deviation. The paper adds Gaussian noise in the training of MLP and RMA, without a
+# number; legged_gym's uniform +-0.1 m has this deviation.
 HEIGHT_NOISE = 0.06
 ROLL_DROP_RATE = 1e-4  # paper
 LATENT = 8  # size of RMA's z, Kumar et al.
-# Steps of a last stage, which chooses among policies or guesses z, relative to the steps of a policy that acts. Ours.
+# Steps of a last stage, which chooses among policies or guesses z, relative to the steps of a
+# policy that acts. Ours.
 LAST_STAGE = 0.2
 
 
@@ -74,8 +78,8 @@ class Policy(nn.Module):
         return self.log_std.clamp(*LOG_STD_BOUNDS).exp()
 
     def sample_masks(self, n: int, generator: torch.Generator) -> Masks:
-        """The noise on the heights is drawn and stored as dropout masks are: the update sees what the rollout saw, and the
-        critic sees clean heights."""
+        """The noise on the heights is drawn and stored as dropout masks are: the update sees what
+        the rollout saw, and the critic sees clean heights."""
         if not (self.height_noise and self.num_heights):
             return {}
         noise = torch.randn(n, *SCAN_SHAPE, generator=generator, device=generator.device)
@@ -105,10 +109,12 @@ class MLP(Policy):
 
 
 class MirroredMLP(MLP):
-    """Our control: an MLP averaged with its answer to the mirrored state, mirrored back. Symmetry, but no legs that share.
+    """Our control: an MLP averaged with its answer to the mirrored state, mirrored back. Symmetry,
+    but no legs that share.
 
-    In leg frames the mirror image of a state is the same numbers with left and right legs exchanged (and the scan's columns
-    reversed): a robot that limps on FL is to it a mirrored robot that limps on FR.
+    In leg frames the mirror image of a state is the same numbers with left and right legs exchanged
+    (and the scan's columns reversed): a robot that limps on FL is to it a mirrored robot that limps
+    on FR.
     """
 
     def __init__(self, robot: Robot, task: Task, scan: bool):
@@ -128,11 +134,13 @@ class MirroredMLP(MLP):
 class RollDrop(MLP):
     """The MLP whose hidden neurons are dropped, at a tiny rate, while it acts.
 
-    The update knows nothing of it: pi_new(a|s) is that of the whole network, pi_old(a|s, mask) was not. So PPO's ratio is
-    not 1 where a neuron was dropped, even before a weight has moved: a random number that PPO takes for progress or clips.
-    With n = 896 neurons and rate p, a sample is untouched with probability (1 - p)^n: 91 % at the paper's 1e-4,
-    hence the tiny rate; 0.01 % at 1e-2. `python evaluate.py dropout_ratio` draws it. Consistent dropout replays the masks
-    and may drop a tenth of all features.
+    The update knows nothing of it: pi_new(a|s) is that of the whole network, pi_old(a|s, mask) was
+    not. So PPO's ratio is
+    not 1 where a neuron was dropped, even before a weight has moved: a random number that PPO takes
+    for progress or clips. With n = 896 neurons and rate p, a sample is untouched with probability
+    (1 - p)^n: 91 % at the paper's 1e-4, hence the tiny rate; 0.01 % at 1e-2. `python evaluate.py
+    dropout_ratio` draws it. Consistent dropout replays the masks and may drop a tenth of all
+    features.
     """
 
     height_noise = 0.0
@@ -149,11 +157,12 @@ class RollDrop(MLP):
 
 
 class RMA(Policy):
-    """Rapid motor adaptation. Stage 1, PPO: base(proprioception, heights, z) with z = encoder(privileged). Stage 2,
+    """Rapid motor adaptation. Stage 1, PPO: base(proprioception, heights, z) with z =
+    encoder(privileged). Stage 2,
     supervised: adaptation(past 50 steps) learns to say z while it drives the frozen base.
 
-    Whether z is known or guessed follows from the observation: where `past` is there, it is guessed. At test only
-    `past` is there.
+    Whether z is known or guessed follows from the observation: where `past` is there, it is
+    guessed. At test only `past` is there.
     """
 
     height_noise = HEIGHT_NOISE
@@ -193,7 +202,8 @@ class RMA(Policy):
 
 
 class Adaptation(nn.Module):
-    """z from 50 steps: each step to 32 numbers, then convolutions over time (Kumar et al.'s sizes)."""
+    """z from 50 steps: each step to 32 numbers, then convolutions over time (Kumar et al.'s
+    sizes)."""
 
     def __init__(self, frame: int):
         super().__init__()
@@ -232,10 +242,11 @@ class AdaptationLearner(Learner):
 
 
 class ROAM(Policy):
-    """Robust autonomous modulation: at each step, act by behaviour i ~ softmax(V_1(s), ..., V_K(s)).
+    """Robust autonomous modulation: at each step, act by behaviour i ~ softmax(V_1(s), ...,
+    V_K(s)).
 
-    Every behaviour is an MLP that was trained in one situation. In the last stage each acts in its own situation (the
-    observation names it) and the values learn who belongs where.
+    Every behaviour is an MLP that was trained in one situation. In the last stage each acts in its
+    own situation (the observation names it) and the values learn who belongs where.
     """
 
     def __init__(self, robot: Robot, task: Task, scan: bool):
@@ -299,11 +310,11 @@ class OwnValue(nn.Module):
 
 
 def roam_loss(values: Tensor, situation: Tensor, target: Tensor, weight: float = 1.0) -> tuple[Tensor, Tensor]:
-    """Bellman loss of the value that belongs to the situation, and cross-entropy over all of them: the values of
-    a state are logits that have to name the behaviour that visits it.
+    """Bellman loss of the value that belongs to the situation, and cross-entropy over all of them:
+    the values of a state are logits that have to name the behaviour that visits it.
 
-    values (B, K), situation (B,) long, target (B,) return. weight: 1 for stiffness tests (Chen et al.).
-    Returns both parts, each a mean over the batch, the second times `weight`.
+    values (B, K), situation (B,) long, target (B,) return. weight: 1 for stiffness tests (Chen et
+    al.). Returns both parts, each a mean over the batch, the second times `weight`.
     """
     own = values.gather(1, situation[:, None]).squeeze(1)
     return (own - target).square().mean(), weight * nn.functional.cross_entropy(values, situation)
@@ -341,7 +352,8 @@ METHODS = {
 
 
 def make_policy(name: str, robot: Robot, task: Task, scan: bool) -> nn.Module:
-    """A policy for the robot, with fresh weights from torch's global generator. scan: does it read the heights?"""
+    """A policy for the robot, with fresh weights from torch's global generator. scan: does it read
+    the heights?"""
     method = METHODS[name]
     if isinstance(method, ROLTConfig):
         return ROLT(len(robot.legs), len(robot.links), replace(method, scan=scan))

@@ -4,9 +4,10 @@
     python benchmark.py --policies rolt mlp --robots a1 --scan
     python benchmark.py walk                  # trains until the robots walk at 80 % of their command, ROLT and MLP
 
-The limit is what cannot be left away: MuJoCo's bare `Batch.step`, and the policy's and critic's matrix products at the
-rate of one large product (in bf16 where training uses it). What is left are masks, norms, attention's small products,
-copies, the optimiser. Times are of one thread, as in training, and medians: on a shared machine only ratios are steady.
+The limit is what cannot be left away: MuJoCo's bare `Batch.step`, and the policy's and critic's
+matrix products at the rate of one large product (in bf16 where training uses it). What is left are
+masks, norms, attention's small products, copies, the optimiser. Times are of one thread, as in
+training, and medians: on a shared machine only ratios are steady.
 """
 
 import argparse
@@ -55,7 +56,8 @@ def product_rate(bf16: bool) -> float:
 
 
 def iterations(robot: str, name: str, scan: bool, rounds: int = 4, num_envs: int = 256) -> None:
-    """Prints what a whole iteration of training takes, by part, and which share of the limit that is."""
+    """Prints what a whole iteration of training takes, by part, and which share of the limit that
+    is."""
     task = TASKS[first_task(robot)]
     torch.manual_seed(0)
     policy = make_policy(name, ROBOTS[robot], task, scan)
@@ -89,7 +91,8 @@ def iterations(robot: str, name: str, scan: bool, rounds: int = 4, num_envs: int
 
 
 def time_to_walk(robot: str, name: str, most_steps: int = 5_000_000) -> None:
-    """Trains on all cores until the speed has been 80 % of the command over ten iterations; prints minutes and steps."""
+    """Trains on all cores until the speed has been 80 % of the command over ten iterations; prints
+    minutes and steps."""
     with tempfile.TemporaryDirectory() as folder:
         words = ["--robot", robot, "--policy", name, "--out", folder, "--save-minutes", "1000"]
         start = time.monotonic()

@@ -1,4 +1,5 @@
-"""Policies and runs as files: saved whole or not at all, and read without ever running what is inside them.
+"""Policies and runs as files: saved whole or not at all, and read without ever running what is
+inside them.
 
 Two kinds, both of torch.save, both dictionaries of plain values and tensors:
     policy.pt      the policy's weights and what they are for (`CARD`); about 1 MB. This is what evaluate.py reads.
@@ -28,7 +29,8 @@ class CheckpointError(ValueError):
 
 
 def save(content: dict, path: Path) -> None:
-    """Writes to a temporary file beside `path`, then renames it: a crash or a full disk leaves the old file whole."""
+    """Writes to a temporary file beside `path`, then renames it: a crash or a full disk leaves the
+    old file whole."""
     temporary = path.with_name(path.name + ".tmp")
     try:
         with open(temporary, "wb") as file:
@@ -42,7 +44,8 @@ def save(content: dict, path: Path) -> None:
 
 
 def load(path: str | Path) -> dict:
-    """The dictionary in the file. CheckpointError if it is missing, damaged, or of another format."""
+    """The dictionary in the file. CheckpointError if it is missing, damaged, or of another
+    format."""
     if not os.path.isfile(path):
         raise CheckpointError(f"there is no checkpoint {path}")
     try:
@@ -75,10 +78,12 @@ def load_policy(path: str | Path, robot: str | None = None) -> tuple[torch.nn.Mo
 
 
 def start_from(path: str | Path, policy: torch.nn.Module, critic: torch.nn.Module) -> None:
-    """Puts the weights in the file into a fresh policy and, if it is a checkpoint.pt, into a fresh critic.
+    """Puts the weights in the file into a fresh policy and, if it is a checkpoint.pt, into a fresh
+    critic.
 
-    The file may be of a policy without the scan: inputs that it did not have come last, and their weights start at 0, so
-    that nothing changes at first. CheckpointError if the file cannot be used.
+    The file may be of a policy without the scan: inputs that it did not have come last, and their
+    weights start at 0, so that nothing changes at first. CheckpointError if the file cannot be
+    used.
     """
     content = load(path)
     try:

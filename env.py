@@ -1,8 +1,8 @@
-"""N legged robots in MuJoCo, each with a fault of its own, to be used much like a Gymnasium vector env.
+"""N legged robots in MuJoCo, each with a fault of its own; much like a Gymnasium vector env.
 
-The simulator is `mujoco.batch.Batch`; this file adds what the paper's section III and legged_gym define around it:
-observations, commands, resets, pushes, terminations. Rewards are in rewards.py, faults in faults.py, the ground in
-terrain.py, the scandots and their noise in noise.py.
+The simulator is `mujoco.batch.Batch`; this file adds what the paper's section III and legged_gym
+define around it: observations, commands, resets, pushes, terminations. Rewards are in rewards.py,
+faults in faults.py, the ground in terrain.py, the scandots and their noise in noise.py.
 
 Legend: N robots, L legs, J joints a leg, H = 10 steps of history. Numpy, float32 out.
 
@@ -19,19 +19,21 @@ What a policy sees (`Observation`); the numbers are those of J = 3 joints a leg:
       18:21                     direction of gravity in the trunk's frame, less (0, 0, -1)  5
     action     (N, L*J)         a_{t-1} of eq. 2: the previous actions of all legs          1
 
-All of it is in *leg frames*: what a left leg sees and does is mirrored to the right, so that the same number
-means the same motion and the same push on every leg, and what one leg learns holds on the other side, too.
-Right legs, such as the first one, see the trunk's own numbers. The scales make a walk's numbers about 1.
+All of it is in *leg frames*: what a left leg sees and does is mirrored to the right, so that the
+same number means the same motion and the same push on every leg, and what one leg learns holds on
+the other side, too. Right legs, such as the first one, see the trunk's own numbers. The scales make
+a walk's numbers about 1.
 
-What only some read is empty, (N, 0), unless named in `extras`; `privileged` is for critics and RMA's base:
+What only some read is empty, (N, 0), unless named in `extras`; `privileged` is for critics and
+RMA's base:
 
     privileged (N, 2*L*J + 1)   is the joint locked, its motor's strength, the friction     1
     heights    (N, 16, 12)      s_e: trunk z - 0.5 m - ground z at the scandots, +-1 m      5
     past       (N, L, 50, 21)   as `legs`, 50 steps long                                    as above
     situation  (N, 1)           index of the robot's fault among the env's `faults`         1
 
-What rewards and users may read after a step (attributes; copy what you keep, some are the env's own memory; of a
-robot whose episode has ended all but the contacts are the next episode's):
+What rewards and users may read after a step (attributes; copy what you keep, some are the env's own
+memory; of a robot whose episode has ended all but the contacts are the next episode's):
 
     command, linear_velocity, angular_velocity, gravity (N, 3)  as above, unscaled
     joint_error, joint_velocity, torque (N, L, J)               rad, rad/s, N m, in the URDF's frames
@@ -79,11 +81,13 @@ SAVED = (
 
 @dataclass(frozen=True)
 class EnvConfig:
-    """All that training, tests and pictures ask differently of the same env. Ranges are (low, high), uniform."""
+    """All that training, tests and pictures ask differently of the same env. Ranges are (low,
+    high), uniform."""
 
     leg_frames: bool = True  # left legs see and act mirrored; False = the URDF's frames, our No Leg Frames
     episode_seconds: float = 20.0  # legged_gym, and the paper's tests
-    # s that a command lasts, through falls, until the next reset after that; ours (NOTES; legged_gym: 10)
+    # s that a command lasts, through falls, until the next reset after that; ours (NOTES;
+    # legged_gym: 10)
     command_seconds: float = 20.0
     # m/s; ours: the tests walk forward, and to stand earns nothing (NOTES; legged_gym: -1 to 1)
     forward_speed: tuple[float, float] = (0.3, 1.0)
@@ -120,8 +124,8 @@ class Observation(NamedTuple):
 class LocomotionEnv:
     """N robots of one kind; robot i's episode ends, and is restarted by `step`, on its own.
 
-    faults: (probability, fault) pairs; each reset draws one. `pin_faults` fixes one a robot instead. Boxes and
-        skates are there only if one of `faults` needs them.
+    faults: (probability, fault) pairs; each reset draws one. `pin_faults` fixes one a robot
+        instead. Boxes and skates are there only if one of `faults` needs them.
     num_threads: of the simulator, 0 = one a core. Results do not depend on it.
     extras: which of `EXTRAS` the observation holds. None of them changes the simulation.
     terrain: None = flat ground. Robot i stays on column i modulo the number of columns.
@@ -168,8 +172,9 @@ class LocomotionEnv:
         self._velocity_at = self.model.jnt_dofadr[self._joints]
         self._default = np.array(robot.default_pose)  # (L, J)
 
-        # Leg frames. A mount with y > 0 is of a left leg. In its mirror image a turn about y stays as it is, and one
-        # about x or z turns the other way; so do the numbers of MIRROR. All signs 1 are the frames of the URDF.
+        # Leg frames. A mount with y > 0 is of a left leg. In its mirror image a turn about y stays
+        # as it is, and one about x or z turns the other way; so do the numbers of MIRROR. All signs
+        # 1 are the frames of the URDF.
         left = (np.array([y for _, y, _ in robot.mounts]) > 0) & config.leg_frames  # (L,)
         turned = np.array([link.axis[1] == 0 for link in robot.links])  # (J,)
         self._joint_sign = np.where(left[:, None] & turned, -1.0, 1.0)  # (L, J)
@@ -193,13 +198,15 @@ class LocomotionEnv:
     # ------------------------------------------------------------------ interface
 
     def pin_faults(self, faults: list[Fault]) -> None:
-        """Robot i has faults[i] from its next reset on, in every episode (for tests: one a robot)."""
+        """Robot i has faults[i] from its next reset on, in every episode (for tests: one a
+        robot)."""
         if len(faults) != self.num_envs:
             raise ValueError(f"{len(faults)} faults for {self.num_envs} robots")
         self.faults, self.fault_index, self._pinned = list(faults), np.arange(self.num_envs), True
 
     def reset(self, random_ages: bool = False) -> Observation:
-        """Starts an episode on every robot. `random_ages` spreads their ends in time (legged_gym, for training)."""
+        """Starts an episode on every robot. `random_ages` spreads their ends in time (legged_gym,
+        for training)."""
         everyone = np.arange(self.num_envs)
         self._resample_commands(everyone)
         if self.terrain:
@@ -212,7 +219,8 @@ class LocomotionEnv:
         return self.observe()
 
     def step(self, action: np.ndarray) -> tuple[Observation, np.ndarray, np.ndarray, np.ndarray, dict]:
-        """One control step of 20 ms: the joint targets are default pose + action_scale * action, in leg frames.
+        """One control step of 20 ms: the joint targets are default pose + action_scale * action, in
+        leg frames.
 
         Args:
             action: (N, L*J) or (N, L, J), clipped to +-10. ValueError for other shapes, FloatingPointError for NaN.
@@ -222,10 +230,11 @@ class LocomotionEnv:
             terminated: (N,) bool, the robot fell (trunk on the ground, tilt over 60 degrees) or its simulation
                 diverged.
             truncated: (N,) bool, the time was up.
-            info: of the state that the step led to, before any reset: "rewards" {term: (N,)} weighted, per second,
-                "position" (N, 3) m, "speed" and "commanded_speed" forward (N,) m/s, "diverged" (N,) bool.
-                Of time-outs: "truncated_ids" (n,) and "final_observation" (n rows), the true last observations to
-                bootstrap from. Of all n finished episodes: "episode_returns" and "episode_lengths" (n,), in steps.
+            info: of the state that the step led to, before any reset: "rewards" {term: (N,)}
+                weighted, per second, "position" (N, 3) m, "speed" and "commanded_speed" forward
+                (N,) m/s, "diverged" (N,) bool. Of time-outs: "truncated_ids" (n,) and
+                "final_observation" (n rows), the true last observations to bootstrap from. Of all n
+                finished episodes: "episode_returns" and "episode_lengths" (n,), in steps.
         """
         if not hasattr(self, "position"):
             raise RuntimeError("the env has no state yet: call reset() before the first step")
@@ -348,8 +357,8 @@ class LocomotionEnv:
             self._qvel[due, :2] = self.rng.uniform(-speed, speed, size=(int(due.sum()), 2))
 
     def _diverged(self) -> np.ndarray:
-        """(N,) bool, simulations that MuJoCo warns about (it has reset most of them) or whose state ran away;
-        afterwards all states are finite."""
+        """(N,) bool, simulations that MuJoCo warns about (it has reset most of them) or whose state
+        ran away; afterwards all states are finite."""
         tame = (np.abs(self._qvel).max(axis=1) < MAX_SPEED) & np.isfinite(self._qpos).all(axis=1)  # NaN is not <
         if not tame.all():
             self.world.reset(np.flatnonzero(~tame), keyframe=0, stage=mujoco.mjtStage.mjSTAGE_VEL)
@@ -364,7 +373,8 @@ class LocomotionEnv:
         return arrays | {"random": self.rng.bit_generator.state}
 
     def load_state_dict(self, state: dict) -> None:
-        """The inverse of `state_dict`, for an env made with the same arguments and pinned to the same faults."""
+        """The inverse of `state_dict`, for an env made with the same arguments and pinned to the
+        same faults."""
         for name in SAVED:
             getattr(self, name)[...] = state[name]
         self.rng.bit_generator.state = state["random"]
@@ -378,8 +388,8 @@ class LocomotionEnv:
     # ------------------------------------------------------------------ state
 
     def _read_state(self) -> None:
-        """MuJoCo's state in the terms of the table above. A free joint's velocity is linear in the world's frame,
-        angular in the body's."""
+        """MuJoCo's state in the terms of the table above. A free joint's velocity is linear in the
+        world's frame, angular in the body's."""
         shape = self.action.shape
         w, x, y, z = self._qpos[:, 3:7].T
         self.position = self._qpos[:, :3].copy()
@@ -397,8 +407,8 @@ class LocomotionEnv:
         self.link_contact = self._contacts[:, self._link_sensors] > 0
 
     def _read_feet(self) -> None:
-        """Contacts, held for one step: a foot that leaves the ground for a single one has not taken a step
-        (legged_gym). A touchdown is a contact of a foot that was in the air."""
+        """Contacts, held for one step: a foot that leaves the ground for a single one has not taken
+        a step (legged_gym). A touchdown is a contact of a foot that was in the air."""
         contact = self._contacts[:, self._foot_sensors] > 0
         self.foot_contact = contact | self._last_contact
         self._last_contact = contact

@@ -10,10 +10,10 @@
     python evaluate.py dropout_ratio                      # why the dropout masks are stored
     python evaluate.py stiffness --methods rolt --episodes 8 --seconds 10 --out /tmp/quick
 
-Each prints a table and writes EXPERIMENT.csv and EXPERIMENT.png to --out; one row an episode where robots walk. Several
-seeds of a method (NAME.pt, NAME-seed1.pt, ... in checkpoints/) are put together: a cell is the mean over seeds, and over
-the episodes of each. Policies act by their mean, without dropout (ROAM draws which of its behaviours acts). The same seed
-gives the same numbers.
+Each prints a table and writes EXPERIMENT.csv and EXPERIMENT.png to --out; one row an episode where
+robots walk. Several seeds of a method (NAME.pt, NAME-seed1.pt, ... in checkpoints/) are put
+together: a cell is the mean over seeds, and over the episodes of each. Policies act by their mean,
+without dropout (ROAM draws which of its behaviours acts). The same seed gives the same numbers.
 """
 
 import argparse
@@ -56,16 +56,19 @@ def fault_test(args, policies, name: str, task: str, case_name) -> None:
 
 
 def stiffness(args, policies) -> None:
-    """Section IV-A (i), figure "Stiffness test results": one calf locked at a time, 0.75 m/s for 20 s.
+    """Section IV-A (i), figure "Stiffness test results": one calf locked at a time, 0.75 m/s for 20
+    s.
 
-    Seen in training: healthy and FR locked. Unseen: FL, RR and RL locked. In leg frames FL is the mirror image of FR, and
-    a policy that is its own mirror image has as good as seen it; the hind legs are the test.
+    Seen in training: healthy and FR locked. Unseen: FL, RR and RL locked. In leg frames FL is the
+    mirror image of FR, and a policy that is its own mirror image has as good as seen it; the hind
+    legs are the test.
     """
     fault_test(args, policies, "Stiffness test", "stiffness", lambda fault: "".join(j[:2] for j in fault.locked) or "healthy")
 
 
 def damage(args, policies) -> None:
-    """Section IV-A (ii), table "Damage test results": one motor of the hexapod dead, 0.75 m/s for 20 s.
+    """Section IV-A (ii), table "Damage test results": one motor of the hexapod dead, 0.75 m/s for
+    20 s.
 
     Cases are named as in the paper: FLC is the calf of the front left leg, T a thigh.
     """
@@ -77,16 +80,19 @@ def damage(args, policies) -> None:
 
 
 def real_world(args, policies) -> None:
-    """Section IV-C, table "Real-world Experiments", rebuilt in simulation: a Go1 trained on the stiffness task, 10 s.
+    """Section IV-C, table "Real-world Experiments", rebuilt in simulation: a Go1 trained on the
+    stiffness task, 10 s.
 
         weaken   the front left leg's motors at half their strength, the hind right calf tied so that it cannot open
                  beyond its default angle; then each other leg weak in its place
         box      the hind right foot drags a box of 4 kg (20 N) on a tether of 0.8 m
         skates   both front feet are wheels
 
-    These are not the paper's robots, boxes and skates, and how weak, how heavy, how smooth is ours, because the paper says
-    none of it (faults.py, robots.py). Its figures (0.0, 0.4, 1.2 m for RMA, 2.8, 1.5, 4.8 m for ROLT) are of a physical
-    Go1 and no target here: what can be compared is whether a method walks on or falls, and how methods rank.
+    These are not the paper's robots, boxes and skates, and how weak, how heavy, how smooth is ours,
+    because the paper says none of it (faults.py, robots.py). Its figures (0.0, 0.4, 1.2 m for RMA,
+    2.8, 1.5, 4.8 m for ROLT) are of a physical
+    Go1 and no target here: what can be compared is whether a method walks on or falls, and how
+    methods rank.
     """
     rows = []
     for case, fault in REAL_WORLD.items():  # one by one: only those who need a box or wheels have them
@@ -97,8 +103,8 @@ def real_world(args, policies) -> None:
 
 
 def stairs(args, policies) -> None:
-    """Not in the paper: does the policy climb, and with its eyes? Stairs of every level of the training at 0.5 m/s, with
-    clean scandots and blind (all of them read zero)."""
+    """Not in the paper: does the policy climb, and with its eyes? Stairs of every level of the
+    training at 0.5 m/s, with clean scandots and blind (all of them read zero)."""
     rows = []
     for noise, suffix in ((ScanNoise(), ""), (ScanNoise(missing_patches=NUM_PATCHES), " blind")):
         for level in TASKS["terrain"].terrain.levels:
@@ -110,14 +116,15 @@ def stairs(args, policies) -> None:
 
 
 def low_frequency(args, policies) -> None:
-    """Section IV-B (i), figure "Low-frequency noise": stairs at 0.5 m/s, 4 of the 12 patches of the scan each offset as a
-    whole in a random direction, for the whole episode, by a growing distance. (The captions of the paper's two figures
-    are exchanged.)"""
+    """Section IV-B (i), figure "Low-frequency noise": stairs at 0.5 m/s, 4 of the 12 patches of the
+    scan each offset as a whole in a random direction, for the whole episode, by a growing distance.
+    (The captions of the paper's two figures are exchanged.)"""
     noise_test(args, policies, "offset", "Low-frequency noise", "offset of 4 patches of 12 [m]")
 
 
 def high_frequency(args, policies) -> None:
-    """Section IV-B (ii), figure "High-frequency noise": as above, every point shifted in x, y and z by Gaussian noise."""
+    """Section IV-B (ii), figure "High-frequency noise": as above, every point shifted in x, y and z
+    by Gaussian noise."""
     noise_test(args, policies, "sigma", "High-frequency noise", "deviation of every point [m]")
 
 
@@ -137,11 +144,13 @@ def noise_test(args, policies, kind: str, title: str, axis: str) -> None:
 
 @torch.no_grad()
 def attention(args, policies) -> None:
-    """Figure "Elevation maps and attention maps": where the legs look when patches of the scan are missing (read zero).
+    """Figure "Elevation maps and attention maps": where the legs look when patches of the scan are
+    missing (read zero).
 
-    All methods are shown what the last of them saw 4 s into a walk over stairs of STAIRS_LEVEL, clean and with 4 patches
-    missing. Shown is the attention of the leg tokens on the 12 patches in the last layer, mean over legs and heads, made
-    to add up to 1. Printed: the share of it on those 4 patches, and its entropy relative to an even gaze.
+    All methods are shown what the last of them saw 4 s into a walk over stairs of STAIRS_LEVEL,
+    clean and with 4 patches missing. Shown is the attention of the leg tokens on the 12 patches in
+    the last layer, mean over legs and heads, made to add up to 1. Printed: the share of it on those
+    4 patches, and its entropy relative to an even gaze.
     """
     course, (*_, (walker, _)) = Terrain(("stairs",), (STAIRS_LEVEL,) * 3), policies.values()
     env = LocomotionEnv(args.robot, 1, args.seed, 1, config=straight_ahead(walker, 0.5, 4), extras=("heights",), terrain=course)
@@ -169,8 +178,9 @@ def attention(args, policies) -> None:
 
 
 def gaits(args, policies) -> None:
-    """Figure "Unstructured gaits": which foot is on the ground when, for every fault of the robot's task. The picture shows
-    the last second of each case's first episode; the numbers are of all episodes from 2 s on."""
+    """Figure "Unstructured gaits": which foot is on the ground when, for every fault of the robot's
+    task. The picture shows the last second of each case's first episode; the numbers are of all
+    episodes from 2 s on."""
     task = TASKS[first_task(args.robot)]
     cases = {str(fault): fault for fault in (*(fault for _, fault in task.training), *task.unseen)}
     faults, rows, panels = [fault for fault in cases.values() for _ in range(args.episodes)], [], []
@@ -199,11 +209,12 @@ def gaits(args, policies) -> None:
 
 @torch.no_grad()
 def mechanisms(args, policies) -> None:
-    """Is what the claims rest on alive? In states of a healthy walk, how much each method's actions change, in units of
-    their standard deviation, when a part of it is disturbed (`disturbances`). An ablation is worth comparing only if what
-    it takes away changes actions by 0.1 or more.
+    """Is what the claims rest on alive? In states of a healthy walk, how much each method's actions
+    change, in units of their standard deviation, when a part of it is disturbed (`disturbances`).
+    An ablation is worth comparing only if what it takes away changes actions by 0.1 or more.
 
-    Then how well a linear probe names a leg from its history (by chance 1 in L), and the share of the time that each foot
+    Then how well a linear probe names a leg from its history (by chance 1 in L), and the share of
+    the time that each foot
     is on the ground: a fault on a leg that a healthy gait hardly uses (below 0.1) tests nothing.
     """
     rows = []
@@ -227,7 +238,8 @@ def mechanisms(args, policies) -> None:
 
 
 def walking_states(policy, args, terrain: Terrain | None) -> tuple[Observation, dict[str, float]]:
-    """What 32 healthy robots see in 4 s of walking, every tenth step of those that stay up; and the duty factor of each leg."""
+    """What 32 healthy robots see in 4 s of walking, every tenth step of those that stay up; and the
+    duty factor of each leg."""
     seen, act = [], policy.forward
     policy.forward = lambda observation, masks=None: (seen.append(observation), act(observation, masks))[1]
     try:
@@ -260,7 +272,8 @@ def disturbances(policy, states: Observation):
 
 
 def leg_probe(legs: torch.Tensor) -> float:
-    """Share of (B, L, H, frame) histories whose leg a linear classifier names, trained on the first half."""
+    """Share of (B, L, H, frame) histories whose leg a linear classifier names, trained on the first
+    half."""
     B, L = legs.shape[:2]
     x = torch.cat([legs.flatten(2), torch.ones(B, L, 1)], dim=2)
     target = torch.eye(L).expand(B, L, L)
@@ -273,12 +286,12 @@ def leg_probe(legs: torch.Tensor) -> float:
 
 @torch.no_grad()
 def dropout_ratio(args, policies) -> None:
-    """Not in the paper, but its case for consistency (section III-C) in one picture: PPO's ratio before any weight has
-    moved, where it should be 1.
+    """Not in the paper, but its case for consistency (section III-C) in one picture: PPO's ratio
+    before any weight has moved, where it should be 1.
 
-    The first policy collects a rollout with feature dropout at each rate. Then the update's probability of the same
-    actions is computed with the stored masks (consistent dropout), with fresh masks (ordinary dropout) and without masks
-    (what Roll-Drop does).
+    The first policy collects a rollout with feature dropout at each rate. Then the update's
+    probability of the same actions is computed with the stored masks (consistent dropout), with
+    fresh masks (ordinary dropout) and without masks (what Roll-Drop does).
     """
     (policy, _), rows = next(iter(policies.values())), []
     print(f"{'masks':10}{'rate':>8}{'5 %':>10}{'median':>10}{'95 %':>10}{'clipped':>10}")
@@ -296,7 +309,8 @@ def dropout_ratio(args, policies) -> None:
 
 
 def ratios(policy: ROLT, args, num_envs: int = 64) -> dict[str, torch.Tensor]:
-    """{scheme: (samples,) PPO's ratio} of a fresh rollout, the second one, after half a second of walking."""
+    """{scheme: (samples,) PPO's ratio} of a fresh rollout, the second one, after half a second of
+    walking."""
     extras = (*policy.extras, "privileged")
     env = LocomotionEnv(args.robot, num_envs, args.seed, 1, TASKS["stiffness"].training, extras=extras)
     observation, generator = env.reset(random_ages=True), torch.Generator().manual_seed(args.seed)
@@ -334,7 +348,8 @@ SUITABLE = {"attention": ("rolt", "no-pe-drop", "no-feature-drop"), "dropout_rat
 
 
 def find_policies(args) -> dict[Path, tuple]:
-    """{path: (policy, card)}: the files of --checkpoints, or what checkpoints/ holds for this test."""
+    """{path: (policy, card)}: the files of --checkpoints, or what checkpoints/ holds for this
+    test."""
     paths = args.checkpoints
     if not paths:
         folder, stem = Path(__file__).parent / "checkpoints", f"{args.robot}-{args.task}"

@@ -1,8 +1,8 @@
 """Faults as data: what is wrong with one robot, and the function that writes it onto a simulation.
 
-A `Fault` is a few numbers. `write_fault` puts them on chosen robots of a batch, starting from the healthy model each
-time; so the next fault that is written (at every reset) undoes the last one. What the numbers act on is prepared in
-robots.py. Sections IV-A and IV-C of the paper:
+A `Fault` is a few numbers. `write_fault` puts them on chosen robots of a batch, starting from the
+healthy model each time; so the next fault that is written (at every reset) undoes the last one.
+What the numbers act on is prepared in robots.py. Sections IV-A and IV-C of the paper:
 
     limping   "we simply lock the calf joint"             lock("FR_calf")       stiffness test, A1
     damage    "we simply set the torque output to zero"   disable("FR_thigh")   damage test, hexapod
@@ -11,9 +11,11 @@ robots.py. Sections IV-A and IV-C of the paper:
     tow       "pull a box with one single hind right leg" tow("RR")             likewise
     skate     "roller skates are tied to [the] feet"      skate("FR")           likewise
 
-The last two need what a robot alone does not have: the env builds it for the faults that it is made with.
-Faults add up: lock("FR_calf") + weaken("RL", 0.5). A new fault is a field of `Fault`, a line in `write_fault`, a function
-that makes it, and a word for it in `Fault.__str__` and `parse`: its name in tables, options and checkpoints.
+The last two need what a robot alone does not have: the env builds it for the faults that it is made
+with.
+Faults add up: lock("FR_calf") + weaken("RL", 0.5). A new fault is a field of `Fault`, a line in
+`write_fault`, a function that makes it, and a word for it in `Fault.__str__` and `parse`: its name
+in tables, options and checkpoints.
 
     python faults.py            # lists the faults and the training tasks
 """
@@ -58,7 +60,8 @@ def healthy() -> Fault:
 def lock(joint: str) -> Fault:
     """The joint stays at its default angle, e.g. lock("FR_calf"): the paper's limping leg.
 
-    The motor is off: one that pushed against a seized joint would be charged for torque that does nothing.
+    The motor is off: one that pushed against a seized joint would be charged for torque that does
+    nothing.
     """
     return Fault(locked=(joint,))
 
@@ -69,22 +72,25 @@ def disable(joint: str) -> Fault:
 
 
 def weaken(part: str, strength: float) -> Fault:
-    """The motors of a joint or of a whole leg give `strength` (0 to 1) times the torque of healthy ones."""
+    """The motors of a joint or of a whole leg give `strength` (0 to 1) times the torque of healthy
+    ones."""
     if not 0 <= strength <= 1:
         raise ValueError(f"a motor's strength is between 0 and 1, not {strength}")
     return Fault(strength=((part, float(strength)),))
 
 
 def half_lock(joint: str, angle: float) -> Fault:
-    """The joint cannot turn past `angle` [rad] upwards, and turns freely below: for a calf of the A1 or the Go1, a string that
-    keeps it from opening (real-world test). Left legs of the hexapod turn the other way."""
+    """The joint cannot turn past `angle` [rad] upwards, and turns freely below: for a calf of the
+    A1 or the Go1, a string that keeps it from opening (real-world test). Left legs of the hexapod
+    turn the other way."""
     if not np.isfinite(angle):
         raise ValueError(f"an angle is a finite number, not {angle}")
     return Fault(half_locked=((joint, float(angle)),))
 
 
 def tow(leg: str) -> Fault:
-    """The leg's foot is tied to a box that stands behind the robot (its numbers are in robots.py)."""
+    """The leg's foot is tied to a box that stands behind the robot (its numbers are in
+    robots.py)."""
     return Fault(towing=(leg,))
 
 
@@ -99,8 +105,8 @@ def props(faults: list[Fault]) -> dict[str, tuple[str, ...]]:
 
 
 def parse(text: str) -> Fault:
-    """Reads 'healthy', 'lock:JOINT', 'disable:JOINT', 'weaken:LEG:SHARE', 'half-lock:JOINT:ANGLE', 'tow:LEG',
-    'skate:LEG', or several joined with '+'.
+    """Reads 'healthy', 'lock:JOINT', 'disable:JOINT', 'weaken:LEG:SHARE', 'half-lock:JOINT:ANGLE',
+    'tow:LEG', 'skate:LEG', or several joined with '+'.
 
     Raises ValueError with what would be right.
     """
@@ -133,7 +139,8 @@ def parse(text: str) -> Fault:
 
 
 def joint_mask(parts: tuple[str, ...], robot: Robot) -> np.ndarray:
-    """(L*J,) bool, the joints that the names of joints or whole legs mean. ValueError for a name that means none."""
+    """(L*J,) bool, the joints that the names of joints or whole legs mean. ValueError for a name
+    that means none."""
     for part in parts:
         if part not in robot.joints and part not in robot.legs:
             raise ValueError(
@@ -165,10 +172,11 @@ def joint_limits(fault: Fault, robot: Robot, model: mujoco.MjModel) -> np.ndarra
 
 
 def write_fault(fault: Fault, robot: Robot, world: Batch, ids: np.ndarray) -> None:
-    """Makes the robots `ids` of `world` healthy but for `fault`. ValueError if the robot has no such part.
+    """Makes the robots `ids` of `world` healthy but for `fault`. ValueError if the robot has no
+    such part.
 
-    A motor is force = gain . ctrl + bias . (1, q, dq), clipped to its range: scaling all three scales the torque.
-    Friction is the env's to draw anew before each call, but for the box's.
+    A motor is force = gain . ctrl + bias . (1, q, dq), clipped to its range: scaling all three
+    scales the torque. Friction is the env's to draw anew before each call, but for the box's.
     """
     model = world.model
     locked, share = joint_mask(fault.locked, robot), motor_strength(fault, robot)[:, None]  # (L*J,), (L*J, 1)
@@ -208,15 +216,15 @@ class Task:
 
 
 TASKS = {
-    # Section IV-A (i): healthy and FR limping in training, "the other legs limp in the test". Halves: ours. The Go1 of the
-    # real-world test was trained on the same.
+    # Section IV-A (i): healthy and FR limping in training, "the other legs limp in the test".
+    # Halves: ours. The Go1 of the real-world test was trained on the same.
     "stiffness": Task(
         robots=("a1", "go1"),
         training=((0.5, healthy()), (0.5, lock("FR_calf"))),
         unseen=(lock("FL_calf"), lock("RR_calf"), lock("RL_calf")),
     ),
-    # Section IV-A (ii): FRT, MRT, MLC in training, one of them at a time (T thigh, C calf), and the paper's nine in the
-    # test. Quarters: ours.
+    # Section IV-A (ii): FRT, MRT, MLC in training, one of them at a time (T thigh, C calf), and the
+    # paper's nine in the test. Quarters: ours.
     "damage": Task(
         robots=("hexapod",),
         training=(
@@ -229,23 +237,26 @@ TASKS = {
             )
         ),
     ),
-    # Section IV-B: healthy, "on multiple terrains, including stairs, slopes and platforms"; the test is noise (noise.py).
+    # Section IV-B: healthy, "on multiple terrains, including stairs, slopes and platforms"; the
+    # test is noise (noise.py).
     "terrain": Task(robots=("a1",), training=((1.0, healthy()),), unseen=(), terrain=TRAINING_MAP),
 }
 
 
 def first_task(robot: str) -> str:
-    """The name of the first task that is for this robot: what it is trained and shown on unless told otherwise."""
+    """The name of the first task that is for this robot: what it is trained and shown on unless
+    told otherwise."""
     for name, task in TASKS.items():
         if robot in task.robots:
             return name
     raise ValueError(f"no task in faults.py is for the robot {robot}: name it in one of TASKS")
 
 
-# Section IV-C: "we weaken the motor strength of one leg and lock the hind back leg with a string", "pull a box with one
-# single hind right leg", "two roller skates are tied to the robot's front feet". The paper gives no numbers. Ours: half the
-# strength; of the front leg that training never harmed, and of the hind leg that tows, so that both are new; the string at
-# the default angle, where training locks. Which leg is weak decides who falls, so the other three are tested as well.
+# Section IV-C: "we weaken the motor strength of one leg and lock the hind back leg with a string",
+# "pull a box with one single hind right leg", "two roller skates are tied to the robot's front
+# feet". The paper gives no numbers. Ours: half the strength; of the front leg that training never
+# harmed, and of the hind leg that tows, so that both are new; the string at the default angle,
+# where training locks. Which leg is weak decides who falls, so the other three are tested as well.
 REAL_WORLD = {
     "healthy": healthy(),  # ours: what the others are to be compared with
     "weaken": weaken("FL", 0.5) + half_lock("RR_calf", -1.5),

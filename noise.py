@@ -1,17 +1,23 @@
-"""Scandots: the 16 x 12 points around the robot at which it is told the height of the ground; and what can be wrong with
-them (section IV-B of the paper). What MLP and RMA are trained with is in baselines.py.
+"""Scandots: the 16 x 12 points around the robot at which it is told the height of the ground; and
+what can be wrong with them (section IV-B of the paper). What MLP and RMA are trained with is in
+baselines.py.
 
-The grid lies level, turns with the robot's yaw and has its trunk in the middle. Transformers read it as 4 x 3 patches of
-4 x 4 points: the paper has 12 patches; their size is ours, the spacing and the scale of the heights are legged_gym's.
+The grid lies level, turns with the robot's yaw and has its trunk in the middle. Transformers read
+it as 4 x 3 patches of
+4 x 4 points: the paper has 12 patches; their size is ours, the spacing and the scale of the heights
+are legged_gym's.
 
     low frequency   k of the 12 patches are each "offset as a whole by a distance in random directions"
     high frequency  every point is "shifted vertically and laterally with Gaussian noise independently"
     missing         k patches read zero (the paper's attention figure)
 
-A shift is three-dimensional. Its lateral part moves the point at which the ground is read, so it acts before the
-terrain is looked up: beside an edge it matters, on flat ground it does not. Its vertical part adds to the height.
+A shift is three-dimensional. Its lateral part moves the point at which the ground is read, so it
+acts before the
+terrain is looked up: beside an edge it matters, on flat ground it does not. Its vertical part adds
+to the height.
 
-Legend: n robots; 16 points forward (row 0 is the rearmost), 12 to the left (column 0 is the rightmost); 12 patches.
+Legend: n robots; 16 points forward (row 0 is the rearmost), 12 to the left (column 0 is the
+rightmost); 12 patches.
 """
 
 from dataclasses import dataclass
@@ -53,7 +59,8 @@ class ScanNoise:
 
 
 def parse(text: str) -> ScanNoise:
-    """Reads 'clean', 'offset:METRES', 'sigma:METRES', 'missing:PATCHES', or several joined with '+'.
+    """Reads 'clean', 'offset:METRES', 'sigma:METRES', 'missing:PATCHES', or several joined with
+    '+'.
 
     Raises ValueError with what would be right.
     """
@@ -78,7 +85,8 @@ def parse(text: str) -> ScanNoise:
 def scan(terrain: Terrain | None, position: np.ndarray, yaw: np.ndarray, shift: np.ndarray | None = None) -> np.ndarray:
     """(n, 16, 12) float32: 5 clip(trunk z - 0.5 m - ground z, -1, 1) at every point.
 
-    position (n, 3) m and yaw (n,) rad of the trunk; terrain None is flat ground. shift (n, 16, 12, 3) m, in the grid's
+    position (n, 3) m and yaw (n,) rad of the trunk; terrain None is flat ground. shift (n, 16, 12,
+    3) m, in the grid's
     axes: how far off each point is from where the robot believes it.
     """
     forward, left, up = FORWARD, LEFT, 0.0
@@ -100,7 +108,8 @@ def as_patches(points: np.ndarray) -> np.ndarray:
 
 
 def spread(patches: np.ndarray) -> np.ndarray:
-    """(n, 12, ...) a value a patch -> (n, 16, 12, ...) a value a point; patches in ROLT's order, row by row."""
+    """(n, 12, ...) a value a patch -> (n, 16, 12, ...) a value a point; patches in ROLT's order,
+    row by row."""
     rows, columns = (size // PATCH for size in SCAN_SHAPE)
     grid = patches.reshape(len(patches), rows, columns, *patches.shape[2:])
     return grid.repeat(PATCH, axis=1).repeat(PATCH, axis=2)
@@ -112,7 +121,8 @@ def choose_patches(n: int, count: int, rng: np.random.Generator) -> np.ndarray:
 
 
 def patch_shifts(noise: ScanNoise, n: int, rng: np.random.Generator) -> np.ndarray:
-    """(n, 16, 12, 3) m, low frequency: the chosen patches' shift in a direction uniform on the sphere, 0 elsewhere."""
+    """(n, 16, 12, 3) m, low frequency: the chosen patches' shift in a direction uniform on the
+    sphere, 0 elsewhere."""
     direction = rng.normal(size=(n, NUM_PATCHES, 3))
     direction *= noise.offset / np.linalg.norm(direction, axis=2, keepdims=True)
     return spread(direction * choose_patches(n, noise.offset_patches, rng)[:, :, None])
@@ -129,7 +139,8 @@ def missing_points(noise: ScanNoise, n: int, rng: np.random.Generator) -> np.nda
 
 
 class NoisyScan:
-    """The scandots of N robots as they see them. Its random generator is its own: noise changes nothing but the scan."""
+    """The scandots of N robots as they see them. Its random generator is its own: noise changes
+    nothing but the scan."""
 
     def __init__(self, num_envs: int, terrain: Terrain | None, noise: ScanNoise, seed: int | tuple[int, ...]):
         self.terrain, self.noise = terrain, noise
@@ -144,14 +155,16 @@ class NoisyScan:
         self.draw(np.arange(len(self.shift)))
 
     def draw(self, ids: np.ndarray) -> None:
-        """Patches and directions anew for the robots `ids`: at a reset, or before every reading (`ScanNoise.redraw`)."""
+        """Patches and directions anew for the robots `ids`: at a reset, or before every reading
+        (`ScanNoise.redraw`)."""
         if self.noise.offset:
             self.shift[ids] = patch_shifts(self.noise, len(ids), self.rng)
         if self.noise.missing_patches:
             self.missing[ids] = missing_points(self.noise, len(ids), self.rng)
 
     def read(self, ids: np.ndarray, position: np.ndarray, yaw: np.ndarray) -> np.ndarray:
-        """(n, 16, 12) float32 scaled heights for the n robots `ids`, trunks at position (n, 3) m and yaw (n,) rad."""
+        """(n, 16, 12) float32 scaled heights for the n robots `ids`, trunks at position (n, 3) m
+        and yaw (n,) rad."""
         if self.noise == ScanNoise():
             return scan(self.terrain, position, yaw)
         if self.noise.redraw:

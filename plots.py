@@ -20,7 +20,8 @@ def save_figure(figure, picture: Path) -> None:
 
 
 def learning_curve(progress: Path, picture: Path) -> None:
-    """Draws a run's progress.csv: return, speed against the command, episode length, std and KL over steps."""
+    """Draws a run's progress.csv: return, speed against the command, episode length, std and KL
+    over steps."""
     with open(progress, newline="") as file:
         rows = list(csv.DictReader(file))
     column = {name: np.array([float(row[name] or "nan") for row in rows]) for name in rows[0]}
@@ -78,7 +79,8 @@ def curves(panels: Panels, x: tuple[float, ...], picture: Path, title: str, axis
 
 
 def attention_maps(panels: dict[str, dict[str, np.ndarray]], picture: Path) -> None:
-    """A row a situation: its (16, 12) heights, then the (12,) attention of each method on the 4 x 3 patches."""
+    """A row a situation: its (16, 12) heights, then the (12,) attention of each method on the 4 x 3
+    patches."""
     rows, columns = len(panels), max(len(row) for row in panels.values())
     figure, axes = plt.subplots(rows, columns, figsize=(2.6 * columns, 2.9 * rows), layout="constrained", squeeze=False)
     for line, (situation, row) in zip(axes, panels.items()):
@@ -111,7 +113,8 @@ def probe_bars(rows: list[dict], gate: float, picture: Path) -> None:
 
 
 def ratio_bands(rows: list[dict], picture: Path, title: str) -> None:
-    """PPO's ratio against the dropout rate, a band for each way to treat the masks, and the share that PPO clips."""
+    """PPO's ratio against the dropout rate, a band for each way to treat the masks, and the share
+    that PPO clips."""
     labels = {
         "stored": "stored masks (consistent dropout)",
         "fresh": "fresh masks (ordinary dropout)",
@@ -140,7 +143,8 @@ def ratio_bands(rows: list[dict], picture: Path, title: str) -> None:
 def gait_diagrams(
     panels: list[tuple[str, np.ndarray]], legs: tuple[str, ...], dt: float, rows: int, picture: Path, title: str
 ) -> None:
-    """A panel a walk: when each foot was on the ground (a bar). panels: (title, (T, L) bool contacts), row by row."""
+    """A panel a walk: when each foot was on the ground (a bar). panels: (title, (T, L) bool
+    contacts), row by row."""
     columns = len(panels) // rows
     size = (2.6 * columns, (0.2 * len(legs) + 0.6) * rows + 0.4)
     figure, axes = plt.subplots(rows, columns, figsize=size, layout="constrained", squeeze=False)

@@ -1,13 +1,14 @@
-"""PPO with consistent dropout (paper, section III-C; Schulman et al. 2017; Hausknecht and Wagener 2022).
+"""PPO with consistent dropout (paper, section III-C; Schulman et al. 2017; Hausknecht, Wagener 2022).
 
 One iteration is three phases, in this order in the file:
     collect         the policy acts for T steps; its dropout masks are stored with every transition
     compute_gae     advantages and returns
     Learner.update  epochs of minibatches through ppo_loss, with the stored masks replayed
 
-PPO's ratio is pi_new(a|s) / pi_old(a|s). With dropout the policy that acted is pi_old(a|s, mask): so the mask is part of
-what is remembered, as s and a are. On the first minibatch of an update no weight has moved, hence the ratio is exactly
-1; with fresh masks it is not, and PPO would correct differences that are only the dice of the dropout.
+PPO's ratio is pi_new(a|s) / pi_old(a|s). With dropout the policy that acted is pi_old(a|s, mask):
+so the mask is part of what is remembered, as s and a are. On the first minibatch of an update no
+weight has moved, hence the ratio is exactly 1; with fresh masks it is not, and PPO would correct
+differences that are only the dice of the dropout.
 
 Legend: T steps, N robots of this process, B samples of a minibatch, A actions of a robot.
 """
@@ -26,9 +27,10 @@ from rolt import Masks
 @dataclass(frozen=True)
 class PPOConfig:
     steps: int = 24  # T, control steps of an iteration, legged_gym
-    # ours: 1 of 12 minibatches of 1024 samples at 512 robots (legged_gym: 5 of 4, of 24576 at 4096). At this size the
-    # gradient is mostly noise: of what an update gained on its own rollout, fresh rollouts of the same policy saw a
-    # tenth. New samples cost a laptop little more than old ones, and do not repeat their noise.
+    # ours: 1 of 12 minibatches of 1024 samples at 512 robots (legged_gym: 5 of 4, of 24576 at
+    # 4096). At this size the gradient is mostly noise: of what an update gained on its own rollout,
+    # fresh rollouts of the same policy saw a tenth. New samples cost a laptop little more than old
+    # ones, and do not repeat their noise.
     epochs: int = 1
     minibatches: int = 12
     discount: float = 0.99  # gamma, legged_gym
@@ -49,13 +51,16 @@ def network(*sizes: int) -> nn.Sequential:
 
 
 def proprioception(legs: Tensor) -> Tensor:
-    """(B, L, H, 3J + 12) -> (B, H * (L*3J + 12)): what each leg sees of itself, and of the trunk once, as the first leg does."""
+    """(B, L, H, 3J + 12) -> (B, H * (L*3J + 12)): what each leg sees of itself, and of the trunk
+    once, as the first leg does."""
     return torch.cat([legs[..., :-12].transpose(1, 2).flatten(2), legs[:, 0, :, -12:]], dim=2).flatten(1)
 
 
 class Critic(nn.Module):
-    """V(s), the same for all methods: an MLP [512, 256, 128] ELU (legged_gym), without dropout. It is there in training only,
-    so it sees what no policy does: what is wrong with the robot, and clean heights (an asymmetric critic, Pinto et al. 2018).
+    """V(s), the same for all methods: an MLP [512, 256, 128] ELU (legged_gym), without dropout.
+
+    It is there in training only, so it sees what no policy does: what is wrong with the robot, and
+    clean heights (an asymmetric critic, Pinto et al. 2018).
     """
 
     def __init__(self, observation: Observation):
@@ -75,7 +80,8 @@ class Critic(nn.Module):
 
 
 class RolloutBuffer:
-    """T x N transitions, allocated once. `masks[name]` holds what the policy drew for each of them: its dropout masks."""
+    """T x N transitions, allocated once. `masks[name]` holds what the policy drew for each of them:
+    its dropout masks."""
 
     def __init__(self, T: int, observation: Observation, num_actions: int, masks: Masks, device):
         N = len(observation.legs)
@@ -113,7 +119,8 @@ def to_tensors(observation: Observation, device) -> Observation:
 
 
 def mean_action(policy, observation: Observation, masks: Masks | None, bf16: bool) -> Tensor:
-    """(B, A), with the matrix products of the hidden layers in bfloat16 if asked for: in rollout and update alike."""
+    """(B, A), with the matrix products of the hidden layers in bfloat16 if asked for: in rollout
+    and update alike."""
     with torch.autocast(observation.legs.device.type, torch.bfloat16, enabled=bf16):
         return policy(observation, masks)
 
@@ -123,7 +130,8 @@ def collect(
     env: LocomotionEnv, policy, critic: Critic, buffer: RolloutBuffer, observation: Observation,
     generator: torch.Generator, bf16: bool = False,
 ) -> tuple[Observation, list[dict]]:  # fmt: skip
-    """T steps of every robot into `buffer`. Returns the observation to go on from and each step's info."""
+    """T steps of every robot into `buffer`. Returns the observation to go on from and each step's
+    info."""
     device, infos = buffer.reward.device, []
     buffer.std.copy_(policy.std())
     for t in range(len(buffer.reward)):
@@ -161,8 +169,9 @@ def compute_gae(
 ) -> Tensor:
     """Generalised advantage estimation (Schulman et al. 2016), all (T, N) -> (T, N).
 
-    next_value[t] is V of the state that step t led to, before any reset. A termination has no future: its value does
-    not count. A time-out has one that we stop watching: its value counts, but no later step's advantage does.
+    next_value[t] is V of the state that step t led to, before any reset. A termination has no
+    future: its value does not count. A time-out has one that we stop watching: its value counts,
+    but no later step's advantage does.
     """
     advantage, running = torch.zeros_like(reward), torch.zeros_like(reward[0])
     delta = reward + gamma * next_value * ~terminated - value  # the TD error
@@ -194,9 +203,10 @@ def ppo_loss(
 def adapt_learning_rate(rate: float, kl: float, target: float) -> float:
     """legged_gym's rule: slower when the policy moved too far, faster when it hardly moved.
 
-    Applied once an update, to the mean KL of its minibatches. legged_gym applies it after each of its minibatches of
-    24576; after each of ours, where KL is 0 at first and noisy then, the rate swung between 1e-5 and 5e-4, and
-    the surrogate gained a third of what it gains at the same KL with a steady rate.
+    Applied once an update, to the mean KL of its minibatches. legged_gym applies it after each of
+    its minibatches of 24576; after each of ours, where KL is 0 at first and noisy then, the rate
+    swung between 1e-5 and 5e-4, and the surrogate gained a third of what it gains at the same KL
+    with a steady rate.
     """
     if kl > 2 * target:
         return max(1e-5, rate / 1.5)
@@ -218,9 +228,11 @@ def num_processes() -> int:
 
 
 class Learner:
-    """Policy, critic and optimiser. Each process holds a copy and its own samples; gradients are averaged over all.
+    """Policy, critic and optimiser. Each process holds a copy and its own samples; gradients are
+    averaged over all.
 
-    Trains the parameters that require a gradient. The baselines' later stages (baselines.py) override `loss`.
+    Trains the parameters that require a gradient. The baselines' later stages (baselines.py)
+    override `loss`.
     """
 
     def __init__(self, policy, critic: nn.Module, config: PPOConfig, bf16: bool = False):
@@ -242,10 +254,11 @@ class Learner:
         self.learning_rate = state["learning_rate"]
 
     def update(self, buffer: RolloutBuffer, generator: torch.Generator, progress: float = 0.0) -> dict[str, float]:
-        """PPO's epochs on one rollout. progress: of the training, 0 to 1. Returns the means of `loss`'s figures over all
-        minibatches.
+        """PPO's epochs on one rollout. progress: of the training, 0 to 1. Returns the means of
+        `loss`'s figures over all minibatches.
 
-        Raises FloatingPointError with the name of the first tensor that is not finite, before it reaches a weight.
+        Raises FloatingPointError with the name of the first tensor that is not finite, before it
+        reaches a weight.
         """
         config = self.config
         buffer.advantage = compute_gae(

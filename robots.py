@@ -1,8 +1,9 @@
 """Robots as data, and the one function that turns a robot into a MuJoCo model.
 
-A robot is a trunk and L equal legs of J joints; nothing below knows more than that. A new robot is a new
-`Robot(...)` at the end of this file and an entry in `ROBOTS`. Only the front right leg is written down: left legs
-are its mirror image in y, rear legs in x where `Link.rear_mirrors_x` says so.
+A robot is a trunk and L equal legs of J joints; nothing below knows more than that. A new robot is
+a new `Robot(...)` at the end of this file and an entry in `ROBOTS`. Only the front right leg is
+written down: left legs are its mirror image in y, rear legs in x where `Link.rear_mirrors_x` says
+so.
 
 What a fault (faults.py) will change on one robot is prepared here, so that a fault is only numbers:
     joint lock      an inactive equality constraint a joint        -> eq_active
@@ -12,7 +13,8 @@ What a fault (faults.py) will change on one robot is prepared here, so that a fa
     box to tow      a box on a tether, slack without end           -> tendon_range       only built when asked for
     skate           a foot that is a wheel, its brake on           -> dof_frictionloss   only built when asked for
 
-Legend: L legs, J joints a leg. Legs are ordered FR, FL, RR, RL (front/rear, right/left), joints hip, thigh, calf.
+Legend: L legs, J joints a leg. Legs are ordered FR, FL, RR, RL (front/rear, right/left), joints
+hip, thigh, calf.
 
     python robots.py            # prints every robot: masses, limits, gains
 """
@@ -110,14 +112,15 @@ class Robot:
 def build_model(
     robot: Robot, terrain: Terrain | None = None, towing: tuple[str, ...] = (), skating: tuple[str, ...] = ()
 ) -> mujoco.MjModel:
-    """The robot on flat ground or on a terrain. Bodies and actuators in the order of `robot.joints`; keyframe 0 is the
-    default pose.
+    """The robot on flat ground or on a terrain. Bodies and actuators in the order of
+    `robot.joints`; keyframe 0 is the default pose.
 
-    Contacts are robot-ground only. Sensors `contact_<geom>` count the contacts of the trunk, of each link with a
-    capsule, and of each foot.
+    Contacts are robot-ground only. Sensors `contact_<geom>` count the contacts of the trunk, of
+    each link with a capsule, and of each foot.
 
-    towing: legs whose foot gets a tether to one box. skating: legs whose foot becomes a wheel. Both add bodies and
-    joints (find a robot's own by name), and change nothing until faults.py ties the tether or lets go the brake.
+    towing: legs whose foot gets a tether to one box. skating: legs whose foot becomes a wheel. Both
+    add bodies and joints (find a robot's own by name), and change nothing until faults.py ties the
+    tether or lets go the brake.
     """
     if unknown := {*towing, *skating} - set(robot.legs):
         raise ValueError(f"the {robot.name} has no leg {', '.join(sorted(unknown))}; it has {', '.join(robot.legs)}")
@@ -190,7 +193,8 @@ def build_model(
 
 
 def tether_length(robot: Robot, leg: str) -> float:
-    """m; a leg further forward has a tether that is longer by as much, or it would be taut before the robot walks."""
+    """m; a leg further forward has a tether that is longer by as much, or it would be taut before
+    the robot walks."""
     forward = [mount[0] for mount in robot.mounts]
     return TETHER + forward[robot.legs.index(leg)] - min(forward)
 
@@ -213,7 +217,8 @@ def _add_world(spec: mujoco.MjSpec) -> None:
 
 
 def _add_geom(spec: mujoco.MjSpec, body, name: str, kind, size, **where) -> None:
-    """A geom that touches the ground alone and decides the friction there, with a sensor that counts its contacts."""
+    """A geom that touches the ground alone and decides the friction there, with a sensor that
+    counts its contacts."""
     foot = kind == mujoco.mjtGeom.mjGEOM_SPHERE
     body.add_geom(
         name=name, type=kind, size=size, contype=0, conaffinity=1, condim=3, priority=1, friction=[1, 0.005, 0.0001],
@@ -226,9 +231,11 @@ def _add_geom(spec: mujoco.MjSpec, body, name: str, kind, size, **where) -> None
 
 
 def _add_wheel(body, leg: str, foot, radius: float):
-    """A wheel in the foot's place, its axle across the leg: it rolls the way the foot points and grips sideways.
+    """A wheel in the foot's place, its axle across the leg: it rolls the way the foot points and
+    grips sideways.
 
-    Not two numbers of friction instead: MuJoCo's belong to the contact's frame, which does not turn with the foot.
+    Not two numbers of friction instead: MuJoCo's belong to the contact's frame, which does not turn
+    with the foot.
     Not a foot without friction: a skate that could slip sideways would be ice.
     """
     wheel, moment = body.add_body(name=f"{leg}_wheel", pos=foot), 0.4 * WHEEL_MASS * radius**2  # a solid ball
@@ -242,10 +249,11 @@ def _add_wheel(body, leg: str, foot, radius: float):
 
 
 def _add_box(spec: mujoco.MjSpec, legs: tuple[str, ...]) -> tuple[float, ...]:
-    """A box on the ground and a tether to it from the foot of each of the legs. Returns its 7 numbers of qpos.
+    """A box on the ground and a tether to it from the foot of each of the legs. Returns its 7
+    numbers of qpos.
 
-    A tether is a limit on a distance: it pulls when that is reached and is nothing before. The box touches the
-    ground alone, as all geoms do.
+    A tether is a limit on a distance: it pulls when that is reached and is nothing before. The box
+    touches the ground alone, as all geoms do.
     """
     box = spec.worldbody.add_body(name="box", pos=BOX_START)
     box.add_freejoint(name="box")
@@ -271,9 +279,10 @@ def _mirror_inertia(inertia: Inertia, mirror: np.ndarray) -> np.ndarray:
     return np.array(inertia) * [1, 1, 1, x * y, x * z, y * z]
 
 
-# Unitree A1, 12.45 kg. Source: mujoco_menagerie unitree_a1/a1.xml (masses, inertias, limits, armature, friction),
-# Unitree's a1.urdf (trunk box), legged_gym a1_config.py (pose, gains, action scale, start height). Thigh and calf boxes are
-# capsules here: as exact on steps and quicker. The hips, inside the trunk's outline, do not collide.
+# Unitree A1, 12.45 kg. Source: mujoco_menagerie unitree_a1/a1.xml (masses, inertias, limits,
+# armature, friction), Unitree's a1.urdf (trunk box), legged_gym a1_config.py (pose, gains, action
+# scale, start height). Thigh and calf boxes are capsules here: as exact on steps and quicker. The
+# hips, inside the trunk's outline, do not collide.
 _A1_THIGH_Y = -0.08505
 
 A1 = Robot(
@@ -309,8 +318,9 @@ A1 = Robot(
     friction_loss=0.2,
 )  # fmt: skip
 
-# Unitree Go1, 12.74 kg. Source: mujoco_menagerie unitree_go1/go1.xml (masses, inertias, limits, armature, friction), Unitree's
-# go1.urdf (trunk box), legged_gym's a1_config.py (pose, gains, action scale: the same machine in other clothes).
+# Unitree Go1, 12.74 kg. Source: mujoco_menagerie unitree_go1/go1.xml (masses, inertias, limits,
+# armature, friction), Unitree's go1.urdf (trunk box), legged_gym's a1_config.py (pose, gains,
+# action scale: the same machine in other clothes).
 GO1 = Robot(
     name="go1",
     trunk_mass=5.204,
@@ -344,14 +354,16 @@ GO1 = Robot(
     friction_loss=0.2,
 )  # fmt: skip
 
-# ElSpider Air, 30.5 kg: the hexapod of the authors' laboratory (the paper names none). Source: extended_legged_gym
-# el_mini.urdf (masses, inertias, geometry, limits) and elspider_air.h (pose, gains). The hips turn about the vertical,
-# the thighs point up and the calves down. The foot (0.019 kg) is part of the calf. Links are capsules as thick as
-# their boxes. Ours, where the sources are silent: armature and dry friction (the A1's), the start height. And the signs on
-# the left, where the URDF mirrors the axes, too: with its signs all six legs stand at the same angles, and ROLT, which has
-# no other way to tell left from right at first, learned to walk within a million steps but not to hold a course in 1.76.
-# The action scale is ours, too (the source: 0.2 to 0.5): the noise of exploration shakes this heavy robot with its stiff
-# joints about the vertical, by 0.6 rad/s at 0.25, which hides what steering earns; 0.4 at 0.15. (Both were changed at once.)
+# ElSpider Air, 30.5 kg: the hexapod of the authors' laboratory (the paper names none). Source:
+# extended_legged_gym el_mini.urdf (masses, inertias, geometry, limits) and elspider_air.h (pose,
+# gains). The hips turn about the vertical, the thighs point up and the calves down. The foot (0.019
+# kg) is part of the calf. Links are capsules as thick as their boxes. Ours, where the sources are
+# silent: armature and dry friction (the A1's), the start height. And the signs on the left, where
+# the URDF mirrors the axes, too: with its signs all six legs stand at the same angles, and ROLT,
+# which has no other way to tell left from right at first, learned to walk within a million steps
+# but not to hold a course in 1.76. The action scale is ours, too (the source: 0.2 to 0.5): the
+# noise of exploration shakes this heavy robot with its stiff joints about the vertical, by 0.6
+# rad/s at 0.25, which hides what steering earns; 0.4 at 0.15. (Both were changed at once.)
 HEXAPOD = Robot(
     name="hexapod",
     trunk_mass=15.8991,

@@ -1,4 +1,5 @@
-"""ROLT, the robust locomotion transformer: the paper's section III in one file, which needs torch alone.
+"""ROLT, the robust locomotion transformer: the paper's section III in one file, which needs torch
+alone.
 
 Where each equation is:
     eq. 1  e^l = MLP(s^l)             `leg_embedding`, one network for all legs
@@ -7,16 +8,19 @@ Where each equation is:
     III-B  two encoder layers, linear decoder on the leg tokens        `EncoderLayer`, `forward`
     III-C  feature dropout and position embedding (PE) dropout         `sample_masks`, `drop`, `tokens`
 
-Why no position embedding on the legs: with one, each leg learns a controller of its own, and what the front right leg
-has learned about limping stays there. Without one the legs share everything; where a leg is on the robot it must find
-out by comparing its own previous action with the action token.
+Why no position embedding on the legs: with one, each leg learns a controller of its own, and what
+the front right leg has learned about limping stays there. Without one the legs share everything;
+where a leg is on the robot it must find out by comparing its own previous action with the action
+token.
 
-Why the masks are data: PPO compares the policy that acted with the policy that is updated. Drawn anew in the update,
-dropout would make them differ before a single weight has moved. So the rollout's masks are stored with the
-transition and passed to `forward` again (ppo.py); None, at test, means no dropout.
+Why the masks are data: PPO compares the policy that acted with the policy that is updated. Drawn
+anew in the update, dropout would make them differ before a single weight has moved. So the
+rollout's masks are stored with the transition and passed to `forward` again (ppo.py); None, at
+test, means no dropout.
 
-Legend: B samples, L legs, J joints a leg, H steps of history, P = 12 patches, T = L + 1 + P tokens, D = 160 width.
-Observations are the tuple of env.py, as tensors: `legs` (B, L, H, 3J + 12), `action` (B, L*J), `heights` (B, 16, 12).
+Legend: B samples, L legs, J joints a leg, H steps of history, P = 12 patches, T = L + 1 + P tokens,
+D = 160 width. Observations are the tuple of env.py, as tensors: `legs` (B, L, H, 3J + 12), `action`
+(B, L*J), `heights` (B, 16, 12).
 """
 
 import math
@@ -43,13 +47,14 @@ class ROLTConfig:
     scan_shape: tuple[int, int] = (16, 12)  # points forward, left
     patch: int = 4  # points a side: 12 patches, as in the paper
     initial_std: float = 1.0  # legged_gym (NOTES: from 0.7 the robots learn to stand first)
-    # Positions start as large as what they are added to, measured at the start (NOTES): smaller ones never come to life.
+    # Positions start as large as what they are added to, measured at the start (NOTES): smaller
+    # ones never come to life.
     patch_position_std: float = 0.75
     leg_position_std: float = 0.2
     feature_dropout: float = 0.1  # paper; 0 = the ablation No Feature Drop
     pe_dropout: float = 0.75  # paper; 0 = the ablation No PE Drop
-    # How a leg knows which one it is: by the "action" token (the paper), a learned "embedding" a leg (its ablation Module PE),
-    # or "none" (our control No Identity)
+    # How a leg knows which one it is: by the "action" token (the paper), a learned "embedding" a
+    # leg (its ablation Module PE), or "none" (our control No Identity)
     identity: str = "action"
     leg_frames: bool = True  # does it see and act in leg frames (env.py)? False = our ablation No Leg Frames
 
@@ -61,19 +66,21 @@ class ROLTConfig:
 
 
 def draw_mask(shape: tuple[int, ...], p: float, generator: torch.Generator) -> Tensor:
-    """Bools of this shape, False with probability p to within 2^-16. 16 random bits a decision: half the time of torch.rand."""
+    """Bools of this shape, False with probability p to within 2^-16. 16 random bits a decision:
+    half the time of torch.rand."""
     bits = torch.empty(shape, dtype=torch.int16, device=generator.device).random_(generator=generator)  # 0 to 2^15 - 1
     return bits >= round(p * 2**15)
 
 
 def drop(x: Tensor, keep: Tensor | None, p: float) -> Tensor:
-    """Consistent dropout: a stored mask `keep` of x's shape, kept values scaled by 1 / (1 - p); None = identity."""
+    """Consistent dropout: a stored mask `keep` of x's shape, kept values scaled by 1 / (1 - p);
+    None = identity."""
     return x if keep is None else x * keep * (1 / (1 - p))
 
 
 class Decoder(nn.Linear):
-    """The policy's last layer: in fp32 even where the rest is in bf16, and small, to start near the default pose
-    (Andrychowicz et al. 2021; 0.01 is ours)."""
+    """The policy's last layer: in fp32 even where the rest is in bf16, and small, to start near the
+    default pose (Andrychowicz et al. 2021; 0.01 is ours)."""
 
     def __init__(self, width: int, outputs: int):
         super().__init__(width, outputs)
@@ -85,7 +92,8 @@ class Decoder(nn.Linear):
 
 
 class EncoderLayer(nn.Module):
-    """Pre-norm transformer layer (ViT's; the paper names none) with dropout after attention and after the MLP."""
+    """Pre-norm transformer layer (ViT's; the paper names none) with dropout after attention and
+    after the MLP."""
 
     def __init__(self, config: ROLTConfig):
         super().__init__()
@@ -99,8 +107,8 @@ class EncoderLayer(nn.Module):
     def forward(self, x: Tensor, queries: int, keep_attention: Tensor | None, keep_feedforward: Tensor | None):
         """Updates the first `queries` tokens only, from all of them.
 
-        What a token becomes depends on the other tokens' keys and values, never on their queries: leaving out those
-        that nobody reads afterwards changes nothing in the rest.
+        What a token becomes depends on the other tokens' keys and values, never on their queries:
+        leaving out those that nobody reads afterwards changes nothing in the rest.
 
         Args: x (B, T, D); masks (B, queries, D) or None.
         Returns: tokens (B, queries, D), attention weights (B, heads, queries, T).
@@ -123,7 +131,8 @@ class EncoderLayer(nn.Module):
 
 
 class ROLT(nn.Module):
-    """Gaussian policy: the mean of every joint's action from the transformer, and a learned std a kind of joint."""
+    """Gaussian policy: the mean of every joint's action from the transformer, and a learned std a
+    kind of joint."""
 
     # what a policy tells train.py and evaluate.py of itself
     replays_masks = True  # in the update
@@ -156,7 +165,8 @@ class ROLT(nn.Module):
         return self.log_std.clamp(*LOG_STD_BOUNDS).exp().repeat(self.num_legs)
 
     def sample_masks(self, n: int, generator: torch.Generator) -> Masks:
-        """Dropout masks for n samples: (n, P) patches that keep their p_e, (n, tokens, D) features that are kept."""
+        """Dropout masks for n samples: (n, P) patches that keep their p_e, (n, tokens, D) features
+        that are kept."""
         config, masks = self.config, {}
         if config.scan and config.pe_dropout > 0:
             masks["patch_position"] = draw_mask((n, config.num_patches), config.pe_dropout, generator)
@@ -168,12 +178,14 @@ class ROLT(nn.Module):
         return masks
 
     def forward(self, observation, masks: Masks | None = None) -> Tensor:
-        """(B, L*J) mean action: J joint targets from each leg's token. masks: of `sample_masks`, None = test."""
+        """(B, L*J) mean action: J joint targets from each leg's token. masks: of `sample_masks`,
+        None = test."""
         x, _ = self._encode(observation, masks or {})
         return self.decoder(self.norm(x)).flatten(1)  # (B, L, J) -> (B, L*J)
 
     def attention(self, observation) -> Tensor:
-        """(B, layers, heads, L, T) weights that the leg tokens give to [legs, action, patches], without dropout."""
+        """(B, layers, heads, L, T) weights that the leg tokens give to [legs, action, patches],
+        without dropout."""
         _, attention = self._encode(observation, {})
         return torch.stack([weights[:, :, : self.num_legs] for weights in attention], dim=1)
 
@@ -196,13 +208,15 @@ class ROLT(nn.Module):
         return torch.cat([part.float() for part in tokens], dim=1)
 
     def _queries(self, layer: int) -> int:
-        """How many tokens a layer updates: all that the next one reads; after the last only the legs are read."""
+        """How many tokens a layer updates: all that the next one reads; after the last only the
+        legs are read."""
         if layer == self.config.layers - 1:
             return self.num_legs
         return self.num_legs + (self.config.identity == "action") + self.config.num_patches
 
     def _encode(self, observation, masks: Masks) -> tuple[Tensor, list[Tensor]]:
-        """The leg tokens after the last layer (B, L, D), and the attention weights of every layer."""
+        """The leg tokens after the last layer (B, L, D), and the attention weights of every
+        layer."""
         x, attention = self.tokens(observation, masks), []
         for i, layer in enumerate(self.encoder):
             x, weights = layer(x, self._queries(i), masks.get(f"attention_{i}"), masks.get(f"feedforward_{i}"))

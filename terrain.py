@@ -1,17 +1,21 @@
-"""Terrain: a map of tiles, as solids that MuJoCo collides and as the exact height of the ground at any (x, y).
+"""Terrain: a map of tiles, as solids that MuJoCo collides and as the exact height of the ground at
+any (x, y).
 
-A map has rows of levels, one behind the other along x, and columns of kinds, side by side along y. Each tile is 8 m
-square with a flat strip around it; robots start on the strip in front of it and walk on along x, up and down again:
+A map has rows of levels, one behind the other along x, and columns of kinds, side by side along y.
+Each tile is 8 m square with a flat strip around it; robots start on the strip in front of it and
+walk on along x, up and down again:
 
     flat        nothing
     slope       a frustum, up to 2 m inwards, then level
     stairs      a pyramid of 6 steps
     platforms   5 x 5 blocks of random height
 
-Heights grow with the level (legged_gym's formulas, whose curriculum goes from level 0 to 9; -1, -2 and 10 are ours, -1 and -2
-for a policy that comes from flat ground and hardly lifts its feet). Unlike legged_gym's, the ground is not
-a height field but boxes and convex meshes: a height field costs four times as much to collide with, and its steps are
-never quite vertical. All coordinates in metres. Walking robots climb the levels as in legged_gym (`next_row`).
+Heights grow with the level (legged_gym's formulas, whose curriculum goes from level 0 to 9; -1, -2
+and 10 are ours, -1 and -2 for a policy that comes from flat ground and hardly lifts its feet).
+Unlike legged_gym's, the ground is not
+a height field but boxes and convex meshes: a height field costs four times as much to collide with,
+and its steps are never quite vertical. All coordinates in metres. Walking robots climb the levels
+as in legged_gym (`next_row`).
 """
 
 from dataclasses import dataclass
@@ -48,7 +52,8 @@ def block_height(level: int) -> float:
 
 @dataclass(frozen=True)
 class Terrain:
-    """Tile (row, column) covers x from 8 row to 8 row + 8 and y from 8 column - 4 to 8 column + 4. All around is flat."""
+    """Tile (row, column) covers x from 8 row to 8 row + 8 and y from 8 column - 4 to 8 column + 4.
+    All around is flat."""
 
     columns: tuple[str, ...]  # of KINDS
     levels: tuple[int, ...]  # of each row, -2 (easy) to 10
@@ -61,7 +66,8 @@ class Terrain:
 
     @cached_property
     def blocks(self) -> np.ndarray:
-        """(rows, columns, 5, 5) height of every platform: each is low, half or full (legged_gym also digs holes)."""
+        """(rows, columns, 5, 5) height of every platform: each is low, half or full (legged_gym
+        also digs holes)."""
         draws = np.random.default_rng(0).integers(3, size=(len(self.levels), len(self.columns), BLOCKS, BLOCKS))
         platforms = np.array([kind == "platforms" for kind in self.columns])[None, :, None, None]
         tallest = np.array([block_height(level) for level in self.levels])[:, None, None, None]
@@ -69,13 +75,15 @@ class Terrain:
 
     @cached_property
     def _tables(self) -> tuple[np.ndarray, np.ndarray]:
-        """(rows * columns,) each: the rise of the stairs and the gradient of the slope on every tile, 0 where there is none."""
+        """(rows * columns,) each: the rise of the stairs and the gradient of the slope on every
+        tile, 0 where there is none."""
         stairs = [rise(level) * (kind == "stairs") for level in self.levels for kind in self.columns]
         slopes = [gradient(level) * (kind == "slope") for level in self.levels for kind in self.columns]
         return np.array(stairs), np.array(slopes)
 
     def start(self, row: np.ndarray, column: np.ndarray) -> np.ndarray:
-        """(..., 2), where a robot starts that is to walk over the tile: in the middle of the strip before it."""
+        """(..., 2), where a robot starts that is to walk over the tile: in the middle of the strip
+        before it."""
         return TILE * np.stack([row, column], axis=-1)
 
     def height(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
@@ -111,8 +119,8 @@ class Terrain:
                             _add_box(spec, x + centres[i], y + centres[j], BLOCK / 2, top)
 
     def next_row(self, row: np.ndarray, distance: np.ndarray, commanded: np.ndarray, rng) -> np.ndarray:
-        """legged_gym's curriculum, at the end of an episode: up a level after half a tile, down after less than half of the
-        commanded distance; after the last level, any.
+        """legged_gym's curriculum, at the end of an episode: up a level after half a tile, down
+        after less than half of the commanded distance; after the last level, any.
 
         row (n,), distance (n,) m from the start, commanded (n,) m in a whole episode.
         """
@@ -123,8 +131,9 @@ class Terrain:
         return np.where(finished, rng.integers(len(self.levels), size=len(row)), row)
 
 
-# Two fifths of the robots learn on stairs, where the tests are. Steps of 1.4 to 12.2 cm for a robot that stands 30 cm high;
-# a run that began at level 0 (5 cm) learned to stand in front of the stairs.
+# Two fifths of the robots learn on stairs, where the tests are. Steps of 1.4 to 12.2 cm for a robot
+# that stands 30 cm high; a run that began at level 0 (5 cm) learned to stand in front of the
+# stairs.
 TRAINING_MAP = Terrain(columns=("stairs", "slope", "stairs", "platforms", "flat"), levels=(-2, -1, 0, 1, 2, 3, 4))
 
 _SOLID = {"contype": 1, "conaffinity": 0}  # collides with robots, as the ground does

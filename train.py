@@ -7,11 +7,12 @@
     python train.py --robot a1 --paper --device cuda                            # the paper's size
     torchrun --nproc-per-node=2 train.py --robot a1 --paper --device cuda       # on two GPUs
 
-Everything goes to runs/ROBOT-TASK-POLICY-seedN (or --out): policy.pt (for evaluate.py), checkpoint.pt (for --resume),
-progress.csv (a row an iteration) and progress.png.
+Everything goes to runs/ROBOT-TASK-POLICY-seedN (or --out): policy.pt (for evaluate.py),
+checkpoint.pt (for --resume), progress.csv (a row an iteration) and progress.png.
 
-On a CPU every core gets a process of its own with its share of the robots; the processes average their gradients
-(torch.distributed). Two processes of one thread run nearly twice as fast as one process of two threads.
+On a CPU every core gets a process of its own with its share of the robots; the processes average
+their gradients (torch.distributed). Two processes of one thread run nearly twice as fast as one
+process of two threads.
 """
 
 import argparse
@@ -135,7 +136,8 @@ class Part:
 
 
 def train(rank: int, args, sync: str | None = None) -> None:
-    """The training of one process. sync: where the processes find each other (torch.distributed's init_method)."""
+    """The training of one process. sync: where the processes find each other (torch.distributed's
+    init_method)."""
     signals, stop = [], False  # Ctrl-C and SIGTERM: all processes save and end after the iteration
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: signals.append(True))
@@ -181,7 +183,8 @@ def train(rank: int, args, sync: str | None = None) -> None:
         checkpoint.start_from(args.init, policy, part.critic)
 
     def save() -> None:
-        """All that the next iteration depends on; process 0 writes, the others send it their part."""
+        """All that the next iteration depends on; process 0 writes, the others send it their
+        part."""
         mine = {"env": {key: to_tensor(value) for key, value in part.env.state_dict().items()}}
         mine["generator"], everyone = generator.get_state(), [None] * args.processes
         if args.processes > 1:
@@ -272,8 +275,8 @@ class Progress:
                 self.rows = [row for row in csv.DictReader(file) if int(row["iteration"]) <= iteration]
 
     def log(self, row: dict, episodes: float, returns: float, lengths: float, falls: float) -> None:
-        """Writes the row and prints the line (every tenth one if the output is not a terminal). The last four are sums over
-        the last iterations."""
+        """Writes the row and prints the line (every tenth one if the output is not a terminal). The
+        last four are sums over the last iterations."""
         recent = [x / episodes if episodes else math.nan for x in (returns, lengths * CONTROL_DT, falls)]
         row |= dict(zip(("episode_return", "episode_seconds", "falls"), recent))
         row = {name: f"{x:.6g}" if isinstance(x, float) else str(x) for name, x in row.items()}

@@ -1,10 +1,11 @@
-"""One walk of a policy, and what is measured of it: distance, falls, gait; and tables over cases and seeds.
+"""One walk of a policy, and what is measured of it: distance, falls, gait; and tables over cases
+and seeds.
 
     >>> walk = take_a_walk(policy, "a1", [lock("FR_calf")] * 4, speed=0.75, seconds=20.0)
     >>> walk.distance, walk.fall_time
 
-Tests, films, gaits and attention all use it: robots are told to walk straight on, nobody is pushed, starts vary as in
-training. Legend: N robots, T steps of 20 ms, L legs.
+Tests, films, gaits and attention all use it: robots are told to walk straight on, nobody is pushed,
+starts vary as in training. Legend: N robots, T steps of 20 ms, L legs.
 """
 
 import csv
@@ -27,7 +28,8 @@ def to_tensors(observation: Observation) -> Observation:
 
 
 def straight_ahead(policy, speed: float, seconds: float) -> EnvConfig:
-    """Straight on at `speed` m/s from the terrain's first row, without pushes or a time-out within `seconds`."""
+    """Straight on at `speed` m/s from the terrain's first row, without pushes or a time-out within
+    `seconds`."""
     return EnvConfig(
         leg_frames=policy.leg_frames, episode_seconds=seconds + 1.0, forward_speed=(speed, speed),
         heading=(0.0, 0.0), push_speed=0.0, start_rows=1, climb=False,
@@ -58,8 +60,8 @@ def take_a_walk(
 ) -> Walk:
     """Robot i with faults[i]. env_options: of LocomotionEnv, such as terrain and noise.
 
-    A fall is what ends an episode in training: the trunk touches the ground or tilts by more than 60 degrees, or the
-    simulation diverges (that is said on stderr).
+    A fall is what ends an episode in training: the trunk touches the ground or tilts by more than
+    60 degrees, or the simulation diverges (that is said on stderr).
     """
     situations, config, N = [(1.0, fault) for fault in faults], straight_ahead(policy, speed, seconds), len(faults)
     env = LocomotionEnv(robot, N, seed, threads, situations, config, policy.extras, **env_options)
@@ -91,14 +93,15 @@ def take_a_walk(
 
 
 def without_chatter(contacts: np.ndarray) -> np.ndarray:
-    """(T, L): each step takes the majority of itself and its two neighbours, so that a contact or a flight of a single
-    step (20 ms, a bounce) is no stride."""
+    """(T, L): each step takes the majority of itself and its two neighbours, so that a contact or a
+    flight of a single step (20 ms, a bounce) is no stride."""
     padded = np.concatenate([contacts[:1], contacts, contacts[-1:]]).astype(int)
     return padded[:-2] + padded[1:-1] + padded[2:] >= 2
 
 
 def stride_frequency(contacts: np.ndarray, dt: float) -> np.ndarray:
-    """(L,) Hz: strides from a foot's first touchdown to its last one over the time they took; 0 for less than one."""
+    """(L,) Hz: strides from a foot's first touchdown to its last one over the time they took; 0 for
+    less than one."""
     frequency = np.zeros(contacts.shape[1])
     for leg, foot in enumerate(contacts.T):
         touchdowns = np.flatnonzero(foot[1:] & ~foot[:-1])
@@ -108,8 +111,9 @@ def stride_frequency(contacts: np.ndarray, dt: float) -> np.ndarray:
 
 
 def gait(walk: Walk, i: int) -> dict[str, np.ndarray] | None:
-    """Of robot i, from WARM_UP to its first fall; None if that came too soon. (L,) the share of the time that each foot
-    is on the ground (above 0.5 in a walk, below in a run), (L,) strides a second, () feet on the ground."""
+    """Of robot i, from WARM_UP to its first fall; None if that came too soon. (L,) the share of the
+    time that each foot is on the ground (above 0.5 in a walk, below in a run), (L,) strides a
+    second, () feet on the ground."""
     steady = without_chatter(walk.contacts[: walk.steps[i], i])[round(WARM_UP / CONTROL_DT) :]
     if len(steady) * CONTROL_DT < SHORTEST:
         return None
@@ -121,8 +125,9 @@ def gait(walk: Walk, i: int) -> dict[str, np.ndarray] | None:
 
 
 def walk_cases(args, policies, cases: dict[str, Fault], speed: float, **env_options) -> list[dict]:
-    """Every policy on every case, `args.episodes` robots each: the rows of the CSV file. Distance is as walked; `share`
-    is of the commanded distance, and no more than 1 (to run ahead is no success)."""
+    """Every policy on every case, `args.episodes` robots each: the rows of the CSV file. Distance
+    is as walked; `share` is of the commanded distance, and no more than 1 (to run ahead is no
+    success)."""
     faults = [fault for fault in cases.values() for _ in range(args.episodes)]
     labels = [(case, episode) for case in cases for episode in range(args.episodes)]
     rows = []
@@ -140,7 +145,8 @@ def walk_cases(args, policies, cases: dict[str, Fault], speed: float, **env_opti
 
 
 def cell(rows: list[dict], method: str, case: str, column: str) -> tuple[float, float]:
-    """Mean over seeds of the mean over episodes, and the standard deviation over seeds (over episodes if there is one)."""
+    """Mean over seeds of the mean over episodes, and the standard deviation over seeds (over
+    episodes if there is one)."""
     mine = [row for row in rows if row["method"] == method and row["case"] == case]
     seeds = [[float(row[column]) for row in mine if row["seed"] == seed] for seed in {row["seed"] for row in mine}]
     means = [np.mean(values) for values in seeds]
@@ -148,8 +154,8 @@ def cell(rows: list[dict], method: str, case: str, column: str) -> tuple[float, 
 
 
 def report(args, rows: list[dict], name: str, title: str, columns: dict[str, str], marks: dict[str, str] = {}) -> dict:
-    """Prints a table a column of the rows, writes the CSV file. columns: {column: what it is}; marks: {case: what to say
-    of it}. Returns {what: {method: (means, deviations)}} for a chart."""
+    """Prints a table a column of the rows, writes the CSV file. columns: {column: what it is};
+    marks: {case: what to say of it}. Returns {what: {method: (means, deviations)}} for a chart."""
     write_csv(args.out / f"{name}.csv", rows)
     methods, cases = ([*dict.fromkeys(row[key] for row in rows)] for key in ("method", "case"))
     panels = {what: {m: [*zip(*(cell(rows, m, case, c) for case in cases))] for m in methods} for c, what in columns.items()}

@@ -1,4 +1,5 @@
-"""A trained policy to look at while it walks, with its fault, its command and its noise to change on the way; and films.
+"""A trained policy to look at while it walks, with its fault, its command and its noise to change
+on the way; and films.
 
     python evaluate.py watch                                          # the A1, healthy
     python evaluate.py watch --robot a1 --fault lock:FR_calf --speed 0.5
@@ -6,11 +7,12 @@
     python evaluate.py watch --fault tow:RR --out tow.gif             # no viewer, a moving picture
     python evaluate.py watch --fault healthy lock:FR_calf --out strip.png    # a row of frames a fault
 
-Where there is a display, a window of MuJoCo's viewer opens: the keys up and down change the speed, left and right the
-fault. Elsewhere MuJoCo's browser viewer is served; its panel does the same. (It is open to everybody who can reach the
-port; from another machine it wants `ssh -L 8080:localhost:8080`.) Either way the terminal takes the same words: a fault
-("lock:RL_calf", "healthy"), a speed ("0.5"), noise ("sigma:0.1", "clean"), "again" to start over, "quit". A robot that
-falls starts over by itself.
+Where there is a display, a window of MuJoCo's viewer opens: the keys up and down change the speed,
+left and right the fault. Elsewhere MuJoCo's browser viewer is served; its panel does the same. (It
+is open to everybody who can reach the port; from another machine it wants `ssh -L
+8080:localhost:8080`.) Either way the terminal takes the same words: a fault ("lock:RL_calf",
+"healthy"), a speed ("0.5"), noise ("sigma:0.1", "clean"), "again" to start over, "quit". A robot
+that falls starts over by itself.
 """
 
 import argparse
@@ -55,7 +57,8 @@ def painted(env: LocomotionEnv, fault: Fault) -> mujoco.MjModel:
 
 
 def draw(walk: Walk, robot: int, steps: range, width: int = 480, height: int = 300) -> list[Image.Image]:
-    """Frames of one of the robots at these steps. RuntimeError with the way out where nothing can be drawn."""
+    """Frames of one of the robots at these steps. RuntimeError with the way out where nothing can
+    be drawn."""
     if NO_DISPLAY and "MUJOCO_GL" not in os.environ:  # MuJoCo would look for a window
         from mujoco.egl import GLContext
         from mujoco.rendering.classic import gl_context
@@ -119,8 +122,8 @@ def film(args, policy, faults: list[Fault], options: dict) -> None:
 
 
 class Show:
-    """One robot that walks straight on for ever. `model` and `data` are what a viewer shows; they are new objects after
-    some changes. `said` is the answer to the last word."""
+    """One robot that walks straight on for ever. `model` and `data` are what a viewer shows; they
+    are new objects after some changes. `said` is the answer to the last word."""
 
     def __init__(self, policy, robot: str, fault: Fault, speed: float, seed: int, terrain: Terrain | None, noise: ScanNoise):
         self.policy, self.robot, self.speed, self.seed = policy, robot, speed, seed
@@ -132,7 +135,8 @@ class Show:
         self.start(fault)
 
     def start(self, fault: Fault) -> None:
-        """A new episode in a new env. ValueError if the robot has no such part; then all stays as it was."""
+        """A new episode in a new env. ValueError if the robot has no such part; then all stays as
+        it was."""
         config = straight_ahead(self.policy, self.speed, 3600)
         options = {"extras": self.policy.extras, "terrain": self.terrain, "noise": self.noise}
         env = LocomotionEnv(self.robot, 1, self.seed, 1, [(1.0, fault)], config, **options)
@@ -141,7 +145,8 @@ class Show:
         self.model, self.data = model, mujoco.MjData(model)
 
     def set_fault(self, fault: Fault) -> None:
-        """Without a fall or a reset, unless a box or wheels come or go. ValueError if the robot has no such part."""
+        """Without a fall or a reset, unless a box or wheels come or go. ValueError if the robot has
+        no such part."""
         if props([fault]) != props([self.fault]):
             return self.start(fault)
         write_fault(fault, self.env.robot, self.env.world, np.array([0]))
@@ -149,7 +154,8 @@ class Show:
         self.fault, self.model = fault, painted(self.env, fault)
 
     def hear(self, word: str) -> None:
-        """One of the words that HELP lists. What it cannot read changes nothing, and `said` tells why."""
+        """One of the words that HELP lists. What it cannot read changes nothing, and `said` tells
+        why."""
         try:
             if word == "quit":
                 self.over = True
@@ -194,7 +200,8 @@ class Clock:
 
 
 def desktop(show: Show) -> None:
-    """A window of mujoco.viewer, opened anew when a box or wheels come or go. Closing it ends the show."""
+    """A window of mujoco.viewer, opened anew when a box or wheels come or go. Closing it ends the
+    show."""
     import mujoco.viewer
 
     def key(code: int) -> None:  # GLFW's codes
@@ -222,7 +229,8 @@ def desktop(show: Show) -> None:
 
 
 def browser(show: Show, port: int) -> None:
-    """MuJoCo's viewer as a web page, with a panel of our own. port 0: the first free one from 8080 on."""
+    """MuJoCo's viewer as a web page, with a panel of our own. port 0: the first free one from 8080
+    on."""
     from mujoco.studio import launch_web, messages, plugin, viewer_protocol
     from mujoco.studio.dear_imgui import dear_imgui as imgui
 

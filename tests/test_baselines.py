@@ -112,7 +112,8 @@ def ratio_before_any_update(policy, buffer, learner):
 
 
 def test_roll_drops_ratio_is_off_where_a_neuron_was_dropped(monkeypatch):
-    """At a rate of 1 % nearly every sample of 896 neurons is hit; at the paper's 0.01 %, one in twelve or so."""
+    """At a rate of 1 % nearly every sample of 896 neurons is hit; at the paper's 0.01 %, one in
+    twelve or so."""
     off = {}
     for rate in (1e-2, ROLL_DROP_RATE):
         monkeypatch.setattr("baselines.ROLL_DROP_RATE", rate)

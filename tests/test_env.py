@@ -112,8 +112,8 @@ def test_a_trunk_tilted_by_60_degrees_has_fallen(degrees, falls):
 
 
 def test_body_velocities_and_gravity_are_in_the_trunks_frame():
-    """Yawed 90 degrees left and driven along world x, the robot moves to its right. Pitched nose down by 0.3 rad,
-    gravity points forward."""
+    """Yawed 90 degrees left and driven along world x, the robot moves to its right. Pitched nose
+    down by 0.3 rad, gravity points forward."""
     env = LocomotionEnv("a1", 1, num_threads=1)
     env.reset()
     env._qpos[0, 3:7] = [np.sqrt(0.5), 0, 0, np.sqrt(0.5)]
@@ -195,7 +195,8 @@ def test_air_time_of_a_fall_from_one_metre():
 
 
 def test_a_knee_on_the_ground_is_one_collision():
-    """The trunk one thigh above the ground: the front right calf lies on it, the other legs are folded up."""
+    """The trunk one thigh above the ground: the front right calf lies on it, the other legs are
+    folded up."""
     env = LocomotionEnv("a1", 1, num_threads=1, config=QUIET)
     env.reset()
     angles = np.tile([0.0, 2.6, -2.69], (4, 1))

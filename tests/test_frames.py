@@ -1,5 +1,5 @@
-"""Leg frames: a mirrored robot in a mirrored state says the same of its legs, left and right exchanged; and to act so moves it
-as the mirror image moves."""
+"""Leg frames: a mirrored robot in a mirrored state says the same of its legs, left and right
+exchanged; and to act so moves it as the mirror image moves."""
 
 import numpy as np
 import pytest
@@ -9,7 +9,8 @@ from robots import ROBOTS
 
 
 def mirror_of(robot):
-    """The leg on the other side, and the sign that the mirror gives to each joint's angle: -1 for turns about x and z."""
+    """The leg on the other side, and the sign that the mirror gives to each joint's angle: -1 for
+    turns about x and z."""
     swap = [robot.mounts.index((x, -y, z)) for x, y, z in robot.mounts]
     return swap, np.array([1.0 if link.axis[1] else -1.0 for link in robot.links])
 

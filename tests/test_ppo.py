@@ -20,7 +20,8 @@ def column(*values):
 
 
 def test_gae_by_hand():
-    """gamma 0.5, lambda 0.5. Three robots: one lives on, one dies in step 1, one runs out of time in step 1."""
+    """gamma 0.5, lambda 0.5. Three robots: one lives on, one dies in step 1, one runs out of time
+    in step 1."""
     none, middle = torch.zeros(3, 1, dtype=torch.bool), torch.tensor([[False], [True], [False]])
     reward, value, following = column(1, 2, 3), column(4, 8, 16), column(8, 16, 32)
     # td errors: 1 + 4 - 4 = 1, 2 + 8 - 8 = 2, 3 + 16 - 16 = 3
@@ -33,7 +34,8 @@ def test_gae_by_hand():
 
 def test_loss_by_hand():
     config = PPOConfig(clip=0.2, value_weight=0.5)
-    # ratios 1, 2 (clipped to 1.2), 0.5 (with a bad action: clipped to 0.8), 0.5 (with a good one: not clipped)
+    # ratios 1, 2 (clipped to 1.2), 0.5 (with a bad action: clipped to 0.8), 0.5 (with a good one:
+    # not clipped)
     log_prob = torch.tensor([0.0, math.log(2), math.log(0.5), math.log(0.5)])
     advantage = torch.tensor([1.0, 1.0, -1.0, 1.0])
     # value errors: 1; clipped 0.2 from old instead of 2 away: 3 - 1.8; ...
@@ -100,7 +102,8 @@ def test_ratio_is_one_in_bf16_too():
 
 @torch.no_grad()
 def test_the_critic_sees_what_policies_do_not():
-    """Another friction, another fault: another value, the same actions. Noise on heights is the policy's alone."""
+    """Another friction, another fault: another value, the same actions. Noise on heights is the
+    policy's alone."""
     torch.manual_seed(0)
     policy = make_policy("mlp", A1, TASKS["terrain"], True)
     env = LocomotionEnv("a1", 4, 0, 1, extras=("privileged", "heights"), terrain=TASKS["terrain"].terrain)
@@ -129,7 +132,8 @@ def test_first_minibatch_of_an_update_has_ratio_one():
 
 
 def test_update_is_ppo_as_one_would_write_it_down():
-    """Two epochs of three minibatches, half of the training done: minibatches, masks, entropy, clipping by plain autograd."""
+    """Two epochs of three minibatches, half of the training done: minibatches, masks, entropy,
+    clipping by plain autograd."""
     policy, critic, buffer, generator = rollout()
     plain_policy, plain_critic = copy.deepcopy((policy, critic))
     start = [p.clone() for module in (policy, critic) for p in module.parameters()]
@@ -183,7 +187,8 @@ def test_timeouts_bootstrap_from_the_true_last_observation():
 
 
 def test_the_buffer_holds_what_the_env_answered():
-    """A twin of the env is given the buffer's actions. One of three robots begins on its back; all time out in step 5."""
+    """A twin of the env is given the buffer's actions. One of three robots begins on its back; all
+    time out in step 5."""
     policy, critic, _, generator = rollout()
     env, twin = (LocomotionEnv("a1", 3, 0, 1, config=EnvConfig(episode_seconds=0.1), extras=("privileged",)) for _ in range(2))
     observation, _ = env.reset(), twin.reset()

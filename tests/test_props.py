@@ -1,4 +1,5 @@
-"""The real-world test's half-lock, box and skates: what they do, to whom, and that a reset undoes them."""
+"""The real-world test's half-lock, box and skates: what they do, to whom, and that a reset undoes
+them."""
 
 import csv
 
@@ -49,7 +50,8 @@ def test_without_such_faults_nothing_is_added(robot):
 
 @pytest.mark.parametrize("tied", [True, False])
 def test_the_tether_pulls_and_never_pushes(tied):
-    """In the air and without weight, the tether alone moves the box: set 1 m off, at its length, and at the foot."""
+    """In the air and without weight, the tether alone moves the box: set 1 m off, at its length,
+    and at the foot."""
     model = build_model(A1, towing=("RR",))
     model.opt.gravity[:] = 0
     tether = model.tendon("RR_tether").id
@@ -72,7 +74,8 @@ def test_the_tether_pulls_and_never_pushes(tied):
 
 
 def test_the_box_hangs_on_its_own_robot_alone():
-    """A hand pulls both boxes away with 10 N more than their friction: one robot holds its box, the other has none."""
+    """A hand pulls both boxes away with 10 N more than their friction: one robot holds its box, the
+    other has none."""
     env = make(tow("RR"), healthy(), config=EnvConfig(push_speed=0.0, start_speed=0.0, friction=(1.25, 1.25)))
     box = env.model.body("box").id
     assert env.world.expanded("geom_friction")[:, env.model.geom("box").id, 0] == pytest.approx(BOX_FRICTION)
@@ -93,7 +96,8 @@ def test_no_tether_is_taut_before_the_robot_walks(robot):
 
 
 def test_a_half_lock_stops_one_side_only():
-    """The calf asked to open by 0.5 rad stays at the string; asked to bend by 0.5 rad it goes like a healthy one."""
+    """The calf asked to open by 0.5 rad stays at the string; asked to bend by 0.5 rad it goes like
+    a healthy one."""
     for target, stopped in ((-1.0, True), (-2.0, False)):
         env = make(half_lock("RR_calf", -1.5), healthy())
         action = np.zeros((2, 4, 3))
@@ -113,7 +117,8 @@ def test_a_half_locked_leg_starts_on_the_right_side_of_its_string():
 
 
 def test_a_skate_rolls_forward_grips_sideways_and_acts_on_its_foot_alone():
-    """A standing robot's feet, pushed for half a second, forward or sideways: only the skate's moves, only forward."""
+    """A standing robot's feet, pushed for half a second, forward or sideways: only the skate's
+    moves, only forward."""
     for axis, rolls in ((0, True), (1, False)):
         env = make(skate("FR"), healthy())
         for _ in range(50):

@@ -101,7 +101,8 @@ def test_a_link_that_cannot_be_mirrored_is_refused():
 
 
 def test_faults_of_legs_and_joints_with_other_names():
-    """A leg may have an underscore in its name; what has no word in the paper is called by its own name."""
+    """A leg may have an underscore in its name; what has no word in the paper is called by its own
+    name."""
     robot = replace(A1, legs=("front_right", "front_left", "rear_right", "rear_left"))
     strength = motor_strength(weaken("front_left", 0.5) + disable("rear_right_calf"), robot)
     assert strength.tolist() == [1, 1, 1, 0.5, 0.5, 0.5, 1, 1, 0, 1, 1, 1]
@@ -125,7 +126,8 @@ def test_stands_under_zero_action(robot):
 
 
 def test_locked_joint_holds_under_load_and_is_free_after_reset():
-    """FR calf locked, 20 kg on its back and the policy flailing: it stays. Healthy again, it moves."""
+    """FR calf locked, 20 kg on its back and the policy flailing: it stays. Healthy again, it
+    moves."""
     env = LocomotionEnv("a1", 1, num_threads=1, faults=((1.0, lock("FR_calf")),), config=QUIET)
     env.reset()
     rng = np.random.default_rng(0)
@@ -169,7 +171,8 @@ def test_weak_motor_gives_its_share_of_the_torque():
 
 
 def test_reset_undoes_every_fault():
-    """After faults of all kinds, a healthy robot's model fields are the healthy model's, to the bit."""
+    """After faults of all kinds, a healthy robot's model fields are the healthy model's, to the
+    bit."""
     env = LocomotionEnv("a1", 3, num_threads=1)
     env.pin_faults([lock("FR_calf"), disable("FL_thigh"), weaken("RR", 0.3)])
     env.reset()
@@ -196,7 +199,8 @@ def test_fault_names_read_back():
 
 
 def test_every_field_of_a_fault_has_a_name_of_its_own():
-    """A field that `__str__` or `parse` forgets makes a fault that calls itself healthy in tables and checkpoints."""
+    """A field that `__str__` or `parse` forgets makes a fault that calls itself healthy in tables
+    and checkpoints."""
     one_each = lock("FR_calf"), weaken("FR", 0.5), half_lock("FR_calf", -1.0), tow("FR"), skate("FR")
     for field in fields(Fault):
         assert sum(bool(getattr(fault, field.name)) for fault in one_each) == 1, f"an example with {field.name} is missing above"

@@ -87,7 +87,8 @@ def test_drop_scales_what_it_keeps():
 
 
 def test_positions_start_as_large_as_what_they_are_added_to():
-    """Random inputs of order 1, as the env's are; the ratio of the sizes (root mean square) is near 1, not 0.02 / 0.6."""
+    """Random inputs of order 1, as the env's are; the ratio of the sizes (root mean square) is near
+    1, not 0.02 / 0.6."""
     policy, legs, obs = model(), model(identity="embedding"), observation(200)
     heights = obs._replace(heights=-2 + 0.3 * obs.heights)  # what a robot on its feet sees, see noise.py
     with torch.no_grad():
@@ -103,7 +104,8 @@ def test_no_identity_reads_no_action_token():
 
 
 def test_bf16_answers_nearly_as_fp32_and_repeats_itself():
-    """What torch rounds to bf16 has 8 bits: 0.4 %. In another batch the same sample is answered to the bit."""
+    """What torch rounds to bf16 has 8 bits: 0.4 %. In another batch the same sample is answered to
+    the bit."""
     policy, obs = model(), observation(64)
     with torch.no_grad():
         exact = policy(obs)
@@ -140,7 +142,8 @@ def test_dropped_positions_are_replaced_by_the_one_vector():
 
 
 def test_patches_are_neighbouring_points():
-    """Raising the 4 x 4 points of rows 4-7, columns 8-11 changes patch (1, 2), number 1 * 3 + 2, alone."""
+    """Raising the 4 x 4 points of rows 4-7, columns 8-11 changes patch (1, 2), number 1 * 3 + 2,
+    alone."""
     policy, obs = model(), observation()
     heights = obs.heights.clone()
     heights[:, 4:8, 8:12] += 1

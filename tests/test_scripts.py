@@ -46,7 +46,8 @@ def tensors(value, name=""):
 
 
 def same_run(one, other):
-    """The same checkpoint to the bit (weights, optimiser, simulation, random states), and the same rows but for the times."""
+    """The same checkpoint to the bit (weights, optimiser, simulation, random states), and the same
+    rows but for the times."""
     a, b = (dict(tensors(torch.load(run / "checkpoint.pt", weights_only=True))) for run in (one, other))
     assert a.keys() == b.keys()
     for name, x in a.items():
@@ -68,7 +69,8 @@ def interrupted(words, out, processes):
 
 @pytest.mark.parametrize("processes, policy", [(1, "rma"), (2, "rolt")])
 def test_interrupted_and_resumed_equals_uninterrupted(tmp_path, processes, policy):
-    """To the bit, over the change of stages, too; rows that a killed run wrote after its checkpoint are dropped."""
+    """To the bit, over the change of stages, too; rows that a killed run wrote after its checkpoint
+    are dropped."""
     words = ["--robot", "a1", "--policy", policy, *SMALL, "--steps", "3840"]
     interrupted(words, tmp_path / "broken", processes)
     with open(tmp_path / "broken" / "progress.csv") as file:
@@ -97,7 +99,8 @@ def test_a_resumed_run_may_not_change(tmp_path, capsys):
 
 
 def test_stairs_begin_with_the_flat_policy(tmp_path):
-    """What reads the heights is new; an MLP's answers do not change at first, for their weights begin at 0."""
+    """What reads the heights is new; an MLP's answers do not change at first, for their weights
+    begin at 0."""
     quick = ["--threads", "1", *SMALL, "--steps", "192"]
     for policy in ("mlp", "rma", "rolt"):
         flat, stairs = tmp_path / f"flat-{policy}", tmp_path / f"stairs-{policy}"

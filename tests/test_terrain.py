@@ -113,7 +113,8 @@ def test_missing_points_are_rolts_patches():
 
 
 def test_a_lateral_shift_reads_the_ground_elsewhere():
-    """On a ramp a point read 0.2 m further ahead says that the ground is 0.2 m higher; a vertical shift says so anywhere."""
+    """On a ramp a point read 0.2 m further ahead says that the ground is 0.2 m higher; a vertical
+    shift says so anywhere."""
     position, yaw, shift = np.array([[0, 0, 0.5]]), np.array([0.0]), np.zeros((1, 16, 12, 3))
     clean = scan(Ramp(), position, yaw)
     shift[..., 0] = 0.2

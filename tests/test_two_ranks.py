@@ -15,7 +15,8 @@ T, N = 3, 8  # steps, robots of all processes
 
 
 def updated(world_size: int, rank: int = 0) -> dict:
-    """One update, with a single minibatch, on this rank's share of a made-up rollout that is the same for all."""
+    """One update, with a single minibatch, on this rank's share of a made-up rollout that is the
+    same for all."""
     torch.set_num_threads(1)
     torch.manual_seed(0)
     policy = make_policy("rolt", A1, TASKS["stiffness"], False)

@@ -1,4 +1,5 @@
-"""Every number of the results goes through here: walks on a world that plays back what was written by hand, gaits, tables."""
+"""Every number of the results goes through here: walks on a world that plays back what was written
+by hand, gaits, tables."""
 
 from types import SimpleNamespace
 
@@ -14,8 +15,8 @@ from robots import A1
 
 
 class Playback:
-    """Robot i walks 0.1 (i + 1) m and earns 1 a step. Those with a locked leg fall in step 3, begin again at 0, and fall in
-    step 5 once more; those that skate diverge in step 4."""
+    """Robot i walks 0.1 (i + 1) m and earns 1 a step. Those with a locked leg fall in step 3, begin
+    again at 0, and fall in step 5 once more; those that skate diverge in step 4."""
 
     robot = A1
 
@@ -77,7 +78,8 @@ def test_rows_name_their_case_and_overspeed_is_no_success(policy):
 
 
 def test_a_cell_is_the_mean_over_seeds_of_the_mean_over_episodes():
-    """Seed 0 has two episodes (1 and 3), seed 1 four (7 each): 2 and 7, hence 4.5 and a deviation of 2.5."""
+    """Seed 0 has two episodes (1 and 3), seed 1 four (7 each): 2 and 7, hence 4.5 and a deviation
+    of 2.5."""
     rows = [{"method": "rolt", "seed": s, "case": "FR", "distance_m": x} for s, x in [(0, 1), (0, 3)] + [(1, 7)] * 4]
     assert walk.cell(rows, "rolt", "FR", "distance_m") == (4.5, 2.5)
     assert walk.cell(rows[:2], "rolt", "FR", "distance_m") == (2.0, 1.0)  # one seed: over its episodes
@@ -110,7 +112,8 @@ TROT = pattern("##..##..##..", "..##..##..##", "############", "............")
 
 
 def test_stride_frequency_by_hand():
-    """Touchdowns at 4, 8 and at 2, 6, 10: a stride of 4 steps of 20 ms is 12.5 Hz. No touchdown or one: no stride."""
+    """Touchdowns at 4, 8 and at 2, 6, 10: a stride of 4 steps of 20 ms is 12.5 Hz. No touchdown or
+    one: no stride."""
     assert walk.stride_frequency(TROT, 0.02) == pytest.approx([12.5, 12.5, 0.0, 0.0])
     assert walk.stride_frequency(pattern("..####..", ".#..#..#"), 0.1) == pytest.approx([0.0, 2 / 0.6])
 
@@ -121,7 +124,8 @@ def test_chatter_of_a_single_step_is_no_stride():
 
 
 def test_a_gait_is_measured_after_the_start_or_not_at_all():
-    """2 s of standing (100 steps) do not count; less than 1 s (50 steps) after them is too little."""
+    """2 s of standing (100 steps) do not count; less than 1 s (50 steps) after them is too
+    little."""
     contacts = np.concatenate([np.ones((100, 4), dtype=bool), np.tile(TROT, (5, 1))])[:, None]
     measured = walk.gait(SimpleNamespace(contacts=contacts, steps=[160]), 0)
     assert measured["duty"] == pytest.approx([0.5, 0.5, 1.0, 0.0]) and measured["feet_down"] == pytest.approx(2.0)
