@@ -1,47 +1,37 @@
-"""The methods that the paper compares ROLT with (section IV), each whole in one place, and the list
-of them all.
+"""The methods that ROLT is compared with (paper, section IV), and the list of them all.
 
-    MLP         all that ROLT sees, flat, into [512, 256, 128]
-    Mirrored MLP  (ours) the MLP averaged with its answer to the mirrored state
-    Roll-Drop   the same network; neurons are dropped in the rollout only (Campanaro et al. 2023)
-    RMA         a base policy that is told what is wrong with the robot, then an adaptation module that guesses it
-                from the past second (Kumar et al. 2021)
-    ROAM        a behaviour a training situation, chosen step by step by value functions (Chen et al. 2024)
-    Module PE, No PE Drop, No Feature Drop, and ours, No Leg Frames and No Identity: switches of
-    ROLT (rolt.py)
+    MLP           all that ROLT sees, flat, into [512, 256, 128]
+    Mirrored MLP  (ours) the MLP, averaged with its answer to the mirrored state
+    Roll-Drop     the MLP; neurons are dropped in the rollout only (Campanaro et al. 2023)
+    RMA           a base policy that is told what is wrong with the robot, then an adaptation module
+                  that guesses it from the past second (Kumar et al. 2021)
+    ROAM          a behaviour a situation, chosen each step by value functions (Chen et al. 2024)
+
+Module PE, No PE Drop, No Feature Drop, and ours, No Leg Frames and No Identity: switches of ROLT.
 
 A policy is a module with forward(observation, masks) -> (B, A) mean action, std() -> (A,),
 sample_masks(n, generator) -> {name: (n, ...) bool}, and a few words on itself (`extras` and what
 follows in ROLT). How it is trained is a list of `Stage`s: most have one.
 
-Legend: B samples, L legs, J joints a leg, A = L*J actions, H = 10 steps of history, K training
-situations.
-
-    python baselines.py         # parameters and cost of every method
+Legend: B samples, L legs, J joints a leg, A = L*J actions, K training situations.
 """
 
 from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor, nn
-from torch.utils.benchmark import Timer
 
-from env import HISTORY, LONG_HISTORY, LocomotionEnv, Observation
-from faults import TASKS, Fault, Task, first_task
-from ppo import Learner, PPOConfig, network, proprioception, to_tensors
-from robots import ROBOTS, Robot
-from rolt import LOG_STD_BOUNDS, ROLT, Decoder, Masks, ROLTConfig, drop
+from faults import Fault, Task
 from noise import HEIGHT_SCALE, SCAN_SHAPE
+from ppo import Learner, PPOConfig, network, proprioception
+from robots import Robot
+from rolt import HISTORY, LOG_STD_BOUNDS, ROLT, Decoder, Masks, Observation, ROLTConfig, drop
 
 HIDDEN = (512, 256, 128)  # legged_gym
-# m, standard deviation. The paper adds Gaussian noise in the training of MLP and RMA, without a
-# number; legged_gym's uniform +-0.1 m has this deviation.
-HEIGHT_NOISE = 0.06
+HEIGHT_NOISE = 0.06  # m, the deviation of legged_gym's uniform +-0.1 m; the paper names none
 ROLL_DROP_RATE = 1e-4  # paper
 LATENT = 8  # size of RMA's z, Kumar et al.
-# Steps of a last stage, which chooses among policies or guesses z, relative to the steps of a
-# policy that acts. Ours.
-LAST_STAGE = 0.2
+LAST_STAGE = 0.2  # steps of a stage that guesses z or chooses a policy, ours (NOTES 14)
 
 
 @dataclass(frozen=True)
@@ -78,8 +68,7 @@ class Policy(nn.Module):
         return self.log_std.clamp(*LOG_STD_BOUNDS).exp()
 
     def sample_masks(self, n: int, generator: torch.Generator) -> Masks:
-        """The noise on the heights is drawn and stored as dropout masks are: the update sees what
-        the rollout saw, and the critic sees clean heights."""
+        """The noise on the heights is drawn and stored as dropout masks are (NOTES 11)."""
         if not (self.height_noise and self.num_heights):
             return {}
         noise = torch.randn(n, *SCAN_SHAPE, generator=generator, device=generator.device)
@@ -102,19 +91,19 @@ class MLP(Policy):
         self.decoder = Decoder(sizes[-1], self.num_actions)
 
     def forward(self, observation: Observation, masks: Masks | None = None) -> Tensor:
-        x = torch.cat([proprioception(observation.legs), self.heights_of(observation, masks).flatten(1)], dim=1)
+        heights = self.heights_of(observation, masks).flatten(1)
+        x = torch.cat([proprioception(observation.legs), heights], dim=1)
         for i, layer in enumerate(self.hidden):
             x = drop(nn.functional.elu(layer(x)), (masks or {}).get(f"hidden_{i}"), ROLL_DROP_RATE)
         return self.decoder(x)
 
 
 class MirroredMLP(MLP):
-    """Our control: an MLP averaged with its answer to the mirrored state, mirrored back. Symmetry,
-    but no legs that share.
+    """Our control: an MLP averaged with its answer to the mirrored state, mirrored back. It has
+    symmetry, but no legs that share.
 
-    In leg frames the mirror image of a state is the same numbers with left and right legs exchanged
-    (and the scan's columns reversed): a robot that limps on FL is to it a mirrored robot that limps
-    on FR.
+    In leg frames (NOTES 1) a state's mirror image is the same numbers with left and right legs
+    exchanged, and the scan's columns reversed: to limp on FL is to limp on FR, mirrored.
     """
 
     def __init__(self, robot: Robot, task: Task, scan: bool):
@@ -123,46 +112,40 @@ class MirroredMLP(MLP):
         self.swap = [robot.mounts.index(mount) for mount in mirrored]  # the leg on the other side
 
     def forward(self, observation: Observation, masks: Masks | None = None) -> Tensor:
-        heights, noise = observation.heights, (masks or {}).get("height_noise")
-        legs, heights = observation.legs[:, self.swap], heights.flip(2) if heights.numel() else heights
-        image = observation._replace(legs=legs, heights=heights)
+        noise = (masks or {}).get("height_noise")
         image_masks = None if noise is None else {"height_noise": noise.flip(2)}
-        back = super().forward(image, image_masks).unflatten(1, (self.num_legs, -1))[:, self.swap].flatten(1)
-        return (super().forward(observation, masks) + back) / 2
+        legs, heights = observation.legs[:, self.swap], observation.heights
+        heights = heights.flip(2) if heights.numel() else heights
+        image = observation._replace(legs=legs, heights=heights)
+        back = super().forward(image, image_masks).unflatten(1, (self.num_legs, -1))
+        return (super().forward(observation, masks) + back[:, self.swap].flatten(1)) / 2
 
 
 class RollDrop(MLP):
     """The MLP whose hidden neurons are dropped, at a tiny rate, while it acts.
 
-    The update knows nothing of it: pi_new(a|s) is that of the whole network, pi_old(a|s, mask) was
-    not. So PPO's ratio is
-    not 1 where a neuron was dropped, even before a weight has moved: a random number that PPO takes
-    for progress or clips. With n = 896 neurons and rate p, a sample is untouched with probability
-    (1 - p)^n: 91 % at the paper's 1e-4, hence the tiny rate; 0.01 % at 1e-2. `python evaluate.py
-    dropout_ratio` draws it. Consistent dropout replays the masks and may drop a tenth of all
-    features.
+    The update knows nothing of it, so where a neuron was dropped PPO's ratio is not 1, even before
+    a weight has moved: a random number that PPO takes for progress or clips. Of 896 neurons at rate
+    p none is dropped with probability (1 - p)^896: 91 % at the paper's 1e-4, hence the tiny rate;
+    0.01 % at 1e-2 (`python evaluate.py dropout_ratio`).
     """
 
     height_noise = 0.0
     replays_masks = False
 
     def sample_masks(self, n: int, generator: torch.Generator) -> Masks:
-        return {
-            f"hidden_{i}": torch.rand(n, layer.out_features, generator=generator, device=generator.device) >= ROLL_DROP_RATE
-            for i, layer in enumerate(self.hidden)
-        }
-
-
-# ---------------------------------------------------------------------- RMA
+        masks = {}
+        for i, layer in enumerate(self.hidden):
+            x = torch.rand(n, layer.out_features, generator=generator, device=generator.device)
+            masks[f"hidden_{i}"] = x >= ROLL_DROP_RATE
+        return masks
 
 
 class RMA(Policy):
-    """Rapid motor adaptation. Stage 1, PPO: base(proprioception, heights, z) with z =
-    encoder(privileged). Stage 2,
-    supervised: adaptation(past 50 steps) learns to say z while it drives the frozen base.
+    """Rapid motor adaptation. Stage 1, PPO: base(proprioception, heights, z = encoder(privileged)).
+    Stage 2, supervised: adaptation(past 50 steps) learns to say z while it drives the frozen base.
 
-    Whether z is known or guessed follows from the observation: where `past` is there, it is
-    guessed. At test only `past` is there.
+    Where the observation has `past`, z is guessed; at test there is no `privileged`.
     """
 
     height_noise = HEIGHT_NOISE
@@ -173,14 +156,13 @@ class RMA(Policy):
         features = 32 if scan else 0
         if scan:
             self.heights = nn.Sequential(  # the paper's "CNN to encode height values"; sizes ours
-                nn.Unflatten(1, (1, SCAN_SHAPE[0])), nn.Conv2d(1, 8, 3, stride=2, padding=1), nn.ELU(),
+                nn.Unflatten(1, (1, -1)), nn.Conv2d(1, 8, 3, stride=2, padding=1), nn.ELU(),
                 nn.Conv2d(8, 16, 3, stride=2, padding=1), nn.ELU(), nn.Flatten(),
                 nn.Linear(self.num_heights, features), nn.ELU(),
             )  # fmt: skip
-        self.encoder = network(2 * self.num_actions + 1, 256, 128, LATENT)  # hidden layers of 256 and 128: Kumar et al.
-        self.base = nn.Sequential(
-            network(HISTORY * self.frame + features + LATENT, *HIDDEN), nn.ELU(), Decoder(HIDDEN[-1], self.num_actions)
-        )
+        self.encoder = network(2 * self.num_actions + 1, 256, 128, LATENT)  # 256, 128: Kumar et al.
+        hidden = network(HISTORY * self.frame + features + LATENT, *HIDDEN)
+        self.base = nn.Sequential(hidden, nn.ELU(), Decoder(HIDDEN[-1], self.num_actions))
         self.adaptation = Adaptation(self.frame)
 
     def forward(self, observation: Observation, masks: Masks | None = None) -> Tensor:
@@ -194,28 +176,27 @@ class RMA(Policy):
     def stages(self, task: Task) -> list[Stage]:
         scan = ("heights",) if self.num_heights else ()
         base = (self.encoder, self.base, self.log_std, *([self.heights] if scan else []))
-        both = (*scan, "privileged", "past")
-        return [
-            Stage("base", 1.0, task.training, self, base, extras=(*scan, "privileged")),
-            Stage("adaptation", LAST_STAGE, task.training, self, (self.adaptation,), NoCritic(), both, AdaptationLearner),
-        ]
+        told, guess = (*scan, "privileged"), (self.adaptation,)
+        first = Stage("base", 1.0, task.training, self, base, None, told)
+        last = (task.training, self, guess, NoCritic(), (*told, "past"), AdaptationLearner)
+        return [first, Stage("adaptation", LAST_STAGE, *last)]
 
 
 class Adaptation(nn.Module):
-    """z from 50 steps: each step to 32 numbers, then convolutions over time (Kumar et al.'s
-    sizes)."""
+    """z from 50 steps: each to 32 numbers, then convolutions over time (sizes of Kumar et al.)."""
 
     def __init__(self, frame: int):
         super().__init__()
         self.step = nn.Sequential(nn.Linear(frame, 32), nn.ELU())
         self.time = nn.Sequential(  # 50 -> 11 -> 7 -> 3 steps
-            nn.Conv1d(32, 32, 8, stride=4), nn.ELU(), nn.Conv1d(32, 32, 5), nn.ELU(), nn.Conv1d(32, 32, 5), nn.ELU(),
-            nn.Flatten(), nn.Linear(3 * 32, LATENT),
+            nn.Conv1d(32, 32, 8, stride=4), nn.ELU(), nn.Conv1d(32, 32, 5), nn.ELU(),
+            nn.Conv1d(32, 32, 5), nn.ELU(), nn.Flatten(), nn.Linear(3 * 32, LATENT),
         )  # fmt: skip
 
     def forward(self, past: Tensor) -> Tensor:
         """(B, L, 50, 3J + 12) -> (B, 8)"""
-        return self.time(self.step(proprioception(past).unflatten(1, (LONG_HISTORY, -1))).transpose(1, 2))
+        steps = proprioception(past).unflatten(1, (past.shape[2], -1))
+        return self.time(self.step(steps).transpose(1, 2))
 
 
 class NoCritic(nn.Module):
@@ -229,21 +210,19 @@ class AdaptationLearner(Learner):
     """Stage 2: mean squared error between the guessed z and the encoder's."""
 
     def __init__(self, policy: RMA, critic: NoCritic, config: PPOConfig, bf16: bool = False):
-        super().__init__(policy, critic, replace(config, learning_rate=1e-3), bf16)  # ours: supervised learning bears more
+        config = replace(config, learning_rate=1e-3)  # ours: supervised learning bears more
+        super().__init__(policy, critic, config, bf16)
 
-    def loss(self, batch: dict, old_std: Tensor, progress: float) -> tuple[Tensor, dict[str, Tensor]]:
+    def loss(self, batch: dict, old_std: Tensor, progress: float) -> tuple[Tensor, dict]:
+        observation = batch["observation"]
         with torch.no_grad():
-            truth = self.policy.encoder(batch["observation"].privileged)
-        error = (self.policy.adaptation(batch["observation"].past) - truth).square().mean()
+            truth = self.policy.encoder(observation.privileged)
+        error = (self.policy.adaptation(observation.past) - truth).square().mean()
         return error, {"other_loss": error}
 
 
-# ---------------------------------------------------------------------- ROAM
-
-
 class ROAM(Policy):
-    """Robust autonomous modulation: at each step, act by behaviour i ~ softmax(V_1(s), ...,
-    V_K(s)).
+    """Robust autonomous modulation: each step by a behaviour i ~ softmax(V_1(s), ..., V_K(s)).
 
     Every behaviour is an MLP that was trained in one situation. In the last stage each acts in its
     own situation (the observation names it) and the values learn who belongs where.
@@ -255,7 +234,7 @@ class ROAM(Policy):
         inputs = HISTORY * self.frame + self.num_heights
         self.critics = nn.ModuleList(BehaviourValue(inputs) for _ in task.training)
         self.generator = torch.Generator().manual_seed(0)  # of the choice at test
-        self.picked = torch.zeros(0, len(task.training))  # (B, K) how often each robot chose each behaviour at test
+        self.picked = torch.zeros(0, len(task.training))  # (B, K) how often each was chosen at test
         del self.log_std  # each behaviour has its own
 
     def std(self) -> Tensor:
@@ -270,21 +249,23 @@ class ROAM(Policy):
             choice = observation.situation.long()  # (B, 1)
         else:
             odds = self.values(observation).softmax(dim=1).cpu()
-            choice = torch.multinomial(odds, 1, generator=self.generator).to(observation.legs.device)
+            choice = torch.multinomial(odds, 1, generator=self.generator)
             if len(self.picked) != len(choice):
                 self.picked = torch.zeros(odds.shape)
-            self.picked += nn.functional.one_hot(choice.squeeze(1).cpu(), odds.shape[1])
-        actions = torch.stack([behaviour(observation) for behaviour in self.behaviours], dim=1)  # (B, K, A)
-        return actions.gather(1, choice[:, :, None].expand(-1, -1, actions.shape[2])).squeeze(1)
+            self.picked += nn.functional.one_hot(choice.squeeze(1), odds.shape[1])
+        actions = torch.stack([act(observation) for act in self.behaviours], dim=1)  # (B, K, A)
+        index = choice.to(actions.device)[:, :, None].expand(-1, -1, actions.shape[2])
+        return actions.gather(1, index).squeeze(1)
 
     def stages(self, task: Task) -> list[Stage]:
         """All steps for each of the behaviours, and some for the values."""
-        stages, extras = [], self.extras
-        for behaviour, (_, fault) in zip(self.behaviours, task.training, strict=True):
-            stages.append(Stage(str(fault), 1.0, ((1.0, fault),), behaviour, (behaviour,), extras=extras))
-        extras, values = (*extras, "situation"), (self.critics,)
-        last = Stage("values", LAST_STAGE, task.training, self, values, OwnValue(self), extras, ROAMLearner)
-        return [*stages, last]
+        stages = []
+        for actor, (_, fault) in zip(self.behaviours, task.training, strict=True):
+            situation = ((1.0, fault),)
+            stages.append(Stage(str(fault), 1.0, situation, actor, (actor,), None, self.extras))
+        extras, values = (*self.extras, "situation"), (self.critics,)
+        last = (task.training, self, values, OwnValue(self), extras, ROAMLearner)
+        return [*stages, Stage("values", LAST_STAGE, *last)]
 
 
 class BehaviourValue(nn.Module):
@@ -295,7 +276,8 @@ class BehaviourValue(nn.Module):
         self.network = network(inputs, *HIDDEN, 1)
 
     def forward(self, observation: Observation) -> Tensor:
-        return self.network(torch.cat([proprioception(observation.legs), observation.heights.flatten(1)], dim=1)).squeeze(1)
+        parts = [proprioception(observation.legs), observation.heights.flatten(1)]
+        return self.network(torch.cat(parts, dim=1)).squeeze(1)
 
 
 class OwnValue(nn.Module):
@@ -309,12 +291,12 @@ class OwnValue(nn.Module):
         return self.policy[0].values(observation).gather(1, observation.situation.long()).squeeze(1)
 
 
-def roam_loss(values: Tensor, situation: Tensor, target: Tensor, weight: float = 1.0) -> tuple[Tensor, Tensor]:
-    """Bellman loss of the value that belongs to the situation, and cross-entropy over all of them:
-    the values of a state are logits that have to name the behaviour that visits it.
+def roam_loss(values: Tensor, situation: Tensor, target: Tensor, weight: float = 1.0):
+    """Bellman loss of the situation's own value, and `weight` times the cross-entropy over all: a
+    state's values are logits that have to name the behaviour that visits it.
 
-    values (B, K), situation (B,) long, target (B,) return. weight: 1 for stiffness tests (Chen et
-    al.). Returns both parts, each a mean over the batch, the second times `weight`.
+    values (B, K), situation (B,) long, target (B,) return -> two means over the batch. weight: 1
+    for stiffness tests (Chen et al.).
     """
     own = values.gather(1, situation[:, None]).squeeze(1)
     return (own - target).square().mean(), weight * nn.functional.cross_entropy(values, situation)
@@ -324,18 +306,17 @@ class ROAMLearner(Learner):
     """The last stage: nothing but the values learns."""
 
     def __init__(self, policy: ROAM, critic: OwnValue, config: PPOConfig, bf16: bool = False):
-        super().__init__(policy, critic, replace(config, learning_rate=config.critic_learning_rate), bf16)
+        config = replace(config, learning_rate=config.critic_learning_rate)
+        super().__init__(policy, critic, config, bf16)
 
-    def loss(self, batch: dict, old_std: Tensor, progress: float) -> tuple[Tensor, dict[str, Tensor]]:
-        observation = batch["observation"]
-        situation = observation.situation.squeeze(1).long()
-        bellman, entropy = roam_loss(self.policy.values(observation), situation, batch["returns"])
+    def loss(self, batch: dict, old_std: Tensor, progress: float) -> tuple[Tensor, dict]:
+        values = self.policy.values(batch["observation"])
+        situation = batch["observation"].situation.squeeze(1).long()
+        bellman, entropy = roam_loss(values, situation, batch["returns"])
         return bellman + entropy, {"value_loss": bellman, "other_loss": entropy}
 
 
-# ---------------------------------------------------------------------- all of them
-
-# `train.py --policy`, in the order in which results list them: a class, or a configuration of ROLT.
+# `train.py --policy`, in the order of the results: a class, or a configuration of ROLT.
 METHODS = {
     "mlp": MLP,
     "mirrored-mlp": MirroredMLP,
@@ -352,8 +333,7 @@ METHODS = {
 
 
 def make_policy(name: str, robot: Robot, task: Task, scan: bool) -> nn.Module:
-    """A policy for the robot, with fresh weights from torch's global generator. scan: does it read
-    the heights?"""
+    """A policy, its weights from torch's global generator. scan: does it read the heights?"""
     method = METHODS[name]
     if isinstance(method, ROLTConfig):
         return ROLT(len(robot.legs), len(robot.links), replace(method, scan=scan))
@@ -365,21 +345,3 @@ def training_stages(policy: nn.Module, task: Task) -> list[Stage]:
     if hasattr(policy, "stages"):
         return policy.stages(task)
     return [Stage("ppo", 1.0, task.training, policy, (policy,), extras=policy.extras)]
-
-
-def main() -> None:
-    torch.set_num_threads(1)
-    for robot in ROBOTS.values():
-        print(f"{robot.name:18}{'parameters':>12}{'one robot acts in':>20}{'256 robots':>14}   (one thread)")
-        for name in METHODS:
-            policy, times = make_policy(name, robot, TASKS[first_task(robot.name)], False).eval(), []
-            for n in (1, 256):
-                observation = to_tensors(LocomotionEnv(robot, n, extras=policy.extras).reset(), "cpu")
-                times.append(Timer("policy(observation)", globals={"policy": policy, "observation": observation}))
-            with torch.no_grad():
-                one, many = (timer.blocked_autorange(min_run_time=0.3).median * 1000 for timer in times)
-            print(f"{name:18}{sum(p.numel() for p in policy.parameters()):12,}{one:17.2f} ms{many:11.1f} ms")
-
-
-if __name__ == "__main__":
-    main()

@@ -1,13 +1,12 @@
-"""How near to the limit of this machine training runs, and how long a newcomer waits for a walk.
+"""How near to this machine's limit training runs, and how long a newcomer waits for a walk.
 
-    python benchmark.py                       # one core: physics, policy, whole iterations; half a minute
-    python benchmark.py --policies rolt mlp --robots a1 --scan
-    python benchmark.py walk                  # trains until the robots walk at 80 % of their command, ROLT and MLP
+    python benchmark.py --policies rolt mlp    # one core, whole iterations; half a minute
+    python benchmark.py walk                   # trains until the speed is 80 % of the command
 
 The limit is what cannot be left away: MuJoCo's bare `Batch.step`, and the policy's and critic's
 matrix products at the rate of one large product (in bf16 where training uses it). What is left are
 masks, norms, attention's small products, copies, the optimiser. Times are of one thread, as in
-training, and medians: on a shared machine only ratios are steady.
+training; on a shared machine only ratios are steady.
 """
 
 import argparse
@@ -19,7 +18,6 @@ import tempfile
 import time
 from pathlib import Path
 
-import numpy as np
 import torch
 from torch.utils.flop_counter import FlopCounterMode
 
@@ -46,78 +44,74 @@ def timed(function, times: list[float]):
 
 def product_rate(bf16: bool) -> float:
     """Floating-point operations a second of a large product, on one thread."""
-    a, b = torch.randn(1024, 512), torch.randn(512, 512)
-    if bf16:
-        a, b = a.bfloat16(), b.bfloat16()
-    times = []
+    dtype, times = torch.bfloat16 if bf16 else torch.float32, []
+    a, b = torch.randn(1024, 512).to(dtype), torch.randn(512, 512).to(dtype)
     for _ in range(50):
         timed(torch.matmul, times)(a, b)
     return 2 * 1024 * 512 * 512 / statistics.median(times)
 
 
 def iterations(robot: str, name: str, scan: bool, rounds: int = 4, num_envs: int = 256) -> None:
-    """Prints what a whole iteration of training takes, by part, and which share of the limit that
-    is."""
-    task = TASKS[first_task(robot)]
+    """Prints the time of a whole training iteration, by part, and which share the limit has."""
+    task, generator = TASKS[first_task(robot)], torch.Generator().manual_seed(0)
     torch.manual_seed(0)
     policy = make_policy(name, ROBOTS[robot], task, scan)
     stage = training_stages(policy, task)[0]
-    extras = tuple({*stage.extras, "privileged"})
-    env = LocomotionEnv(robot, num_envs, 0, 1, stage.faults, EnvConfig(leg_frames=policy.leg_frames), extras)
-    observation, generator = env.reset(random_ages=True), torch.Generator().manual_seed(0)
-    critic = Critic(observation)
-    learner = Learner(stage.actor, critic, PPOConfig(minibatches=num_envs * PPOConfig.steps // 1024), BF16)
-    buffer = RolloutBuffer(PPOConfig.steps, observation, env.num_actions, policy.sample_masks(num_envs, generator), "cpu")
+    config, extras = EnvConfig(leg_frames=policy.leg_frames), {*stage.extras, "privileged"}
+    env = LocomotionEnv(robot, num_envs, 0, 1, stage.faults, config, tuple(extras))
+    observation = env.reset(random_ages=True)
+    critic, T = Critic(observation), PPOConfig.steps
+    learner = Learner(stage.actor, critic, PPOConfig(minibatches=num_envs * T // 1024), BF16)
+    masks = policy.sample_masks(num_envs, generator)
+    buffer = RolloutBuffer(T, observation, env.num_actions, masks, "cpu")
+    parts = (env, stage.actor, critic, buffer)
 
     with FlopCounterMode(display=False) as counter:
-        observation, _ = collect(env, stage.actor, critic, buffer, observation, generator, BF16)
+        observation, _ = collect(*parts, observation, generator, BF16)
         learner.update(buffer, generator)
     operations = counter.get_total_flops() / len(buffer)  # a sample
 
     bare, step, acting, update = [], [], [], []
     env.world.step, env.step = timed(env.world.step, bare), timed(env.step, step)
     for _ in range(rounds):
-        observation, _ = timed(collect, acting)(env, stage.actor, critic, buffer, observation, generator, BF16)
+        observation, _ = timed(collect, acting)(*parts, observation, generator, BF16)
         timed(learner.update, update)(buffer, generator)
-    del env.world.step, env.step  # or the world and its threads would never go: they hold themselves
+    del env.world.step, env.step  # or the world and its threads would never go: a cycle
 
-    samples = rounds * len(buffer)
-    whole, physics = (sum(acting) + sum(update)) / samples, sum(bare) / samples
-    limit = physics + operations / product_rate(BF16)
-    parts = {"physics": physics, "rest of env.step": sum(step) / samples - physics}
-    parts |= {"acting": (sum(acting) - sum(step)) / samples, "update": sum(update) / samples}
-    words = ", ".join(f"{part} {1e6 * seconds:.0f}" for part, seconds in parts.items())
-    print(f"{robot} {name}{' with scan' * scan}: {1 / whole:,.0f} env steps/s, {limit / whole:.0%} of the limit ({words} us)")
+    samples = rounds * len(buffer)  # from here on in us a sample
+    bare, step, acting, update = (1e6 * sum(x) / samples for x in (bare, step, acting, update))
+    whole, limit = acting + update, bare + 1e6 * operations / product_rate(BF16)
+    rate = f"{1e6 / whole:,.0f} env steps/s, {limit / whole:.0%} of the limit"
+    words = f"physics {bare:.0f}, rest of env.step {step - bare:.0f}, acting {acting - step:.0f}"
+    print(f"{robot} {name}{' with scan' * scan}: {rate} ({words}, update {update:.0f} us)")
 
 
 def time_to_walk(robot: str, name: str, most_steps: int = 5_000_000) -> None:
-    """Trains on all cores until the speed has been 80 % of the command over ten iterations; prints
-    minutes and steps."""
+    """Trains on all cores until the speed has been 80 % of the command over ten iterations."""
     with tempfile.TemporaryDirectory() as folder:
+        program, file = Path(__file__).parent / "train.py", Path(folder) / "progress.csv"
         words = ["--robot", robot, "--policy", name, "--out", folder, "--save-minutes", "1000"]
-        start = time.monotonic()
-        training = subprocess.Popen([sys.executable, Path(__file__).parent / "train.py", *words], stdout=subprocess.DEVNULL)
-        rows = []
+        start, rows, says = time.monotonic(), [], f"does not walk in {most_steps / 1e6:.0f}M steps"
+        training = subprocess.Popen([sys.executable, program, *words], stdout=subprocess.DEVNULL)
         while training.poll() is None and (not rows or int(rows[-1]["steps"]) < most_steps):
             time.sleep(2)
-            if (Path(folder) / "progress.csv").exists():
-                with open(Path(folder) / "progress.csv", newline="") as file:
-                    rows = [row for row in csv.DictReader(file) if row["divergences"] is not None]
-            speed, command = (np.sum([float(row[key]) for row in rows[-10:]]) for key in ("speed", "commanded_speed"))
+            if file.exists():  # its last row may be half written
+                table = csv.DictReader(file.read_text().splitlines())
+                rows = [row for row in table if row["divergences"] is not None]
+            speed = sum(float(row["speed"]) for row in rows[-10:])
+            command = sum(float(row["commanded_speed"]) for row in rows[-10:])
             if len(rows) >= 10 and speed >= 0.8 * command:
-                minutes = (time.monotonic() - start) / 60
-                print(f"{robot} {name}: walks after {minutes:.1f} minutes, {int(rows[-1]['steps']) / 1e6:.2f}M env steps", flush=True)
+                minutes, steps = (time.monotonic() - start) / 60, int(rows[-1]["steps"]) / 1e6
+                says = f"walks after {minutes:.1f} minutes, {steps:.2f}M env steps"
                 break
-        else:
-            print(f"{robot} {name}: does not walk yet after {most_steps / 1e6:.0f}M env steps", flush=True)
+        print(f"{robot} {name}: {says}", flush=True)
         training.terminate()
         training.wait()
 
 
 def main(argv: list[str] | None = None) -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter, usage=argparse.SUPPRESS
-    )
+    style = {"formatter_class": argparse.RawDescriptionHelpFormatter, "usage": argparse.SUPPRESS}
+    parser = argparse.ArgumentParser(description=__doc__, **style)
     parser.add_argument("what", nargs="?", choices=("rates", "walk"), default="rates")
     parser.add_argument("--robots", nargs="+", choices=ROBOTS, default=["a1"])
     parser.add_argument("--policies", nargs="+", choices=METHODS, default=["rolt", "mlp"])

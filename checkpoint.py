@@ -1,13 +1,10 @@
-"""Policies and runs as files: saved whole or not at all, and read without ever running what is
-inside them.
+"""Policies and runs as files: saved whole or not at all, and read without running what is inside.
 
 Two kinds, both of torch.save, both dictionaries of plain values and tensors:
-    policy.pt      the policy's weights and what they are for (`CARD`); about 1 MB. This is what evaluate.py reads.
-    checkpoint.pt  the same and everything else that training needs to go on: `train.py --resume`.
+    policy.pt      the policy's weights and what they are for (`CARD`), about 1 MB, for evaluate.py
+    checkpoint.pt  the same and all else that training needs to go on: `train.py --resume`
 
-    >>> policy, card = load_policy("checkpoints/a1-stiffness-rolt.pt")
-
-    python checkpoint.py runs/a1-stiffness-rolt-seed0/policy.pt checkpoints/a1-stiffness-rolt.pt    # half as large, to ship
+    python checkpoint.py runs/a1-stiffness-rolt-seed0/policy.pt rolt.pt     # half as large, to ship
 """
 
 import os
@@ -16,12 +13,12 @@ from pathlib import Path
 
 import torch
 
-from baselines import METHODS, make_policy
+from baselines import make_policy
 from faults import TASKS
 from robots import ROBOTS
 
 FORMAT = 2  # 1 was before leg frames
-CARD = ("robot", "task", "policy", "scan", "seed", "steps", "stages", "init")  # what a policy file says of itself
+CARD = ("robot", "task", "policy", "scan", "seed", "steps", "stages", "init")  # of a policy
 
 
 class CheckpointError(ValueError):
@@ -29,8 +26,7 @@ class CheckpointError(ValueError):
 
 
 def save(content: dict, path: Path) -> None:
-    """Writes to a temporary file beside `path`, then renames it: a crash or a full disk leaves the
-    old file whole."""
+    """Writes beside `path`, then renames: a crash or a full disk leaves the old file whole."""
     temporary = path.with_name(path.name + ".tmp")
     try:
         with open(temporary, "wb") as file:
@@ -40,57 +36,49 @@ def save(content: dict, path: Path) -> None:
         os.replace(temporary, path)
     except (OSError, RuntimeError) as error:  # torch.save's RuntimeError is a full disk
         temporary.unlink(missing_ok=True)
-        raise OSError(f"cannot write {path} ({error}); what was saved there before is untouched") from error
+        raise OSError(f"cannot write {path} ({error}); the file there is untouched") from error
 
 
 def load(path: str | Path) -> dict:
-    """The dictionary in the file. CheckpointError if it is missing, damaged, or of another
-    format."""
+    """The dictionary in the file. CheckpointError if it is missing, damaged, of another format."""
     if not os.path.isfile(path):
         raise CheckpointError(f"there is no checkpoint {path}")
     try:
         content = torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:  # whatever damaged bytes provoke in zip, pickle or torch
-        raise CheckpointError(f"{path} is not a whole checkpoint ({type(error).__name__}): copy or train it again") from error
+        raise CheckpointError(f"{path} is not a whole checkpoint: copy it again") from error
     if not isinstance(content, dict) or content.get("format") != FORMAT:
-        raise CheckpointError(f"{path} is of another version of this program (format {FORMAT} is read): train it again")
+        raise CheckpointError(f"{path} is of another version (not format {FORMAT}): train it again")
     return content
 
 
 def load_policy(path: str | Path, robot: str | None = None) -> tuple[torch.nn.Module, dict]:
-    """The policy in a policy.pt or checkpoint.pt, ready to act, and its card (`CARD`).
-
-    robot: if given, the one it must be for. Raises CheckpointError if the file cannot be used.
-    """
+    """The policy in a policy.pt or checkpoint.pt, ready to act, and its card (`CARD`). robot: if
+    given, the one it must be for. CheckpointError if the file cannot be used."""
     content = load(path)
     try:
-        card, weights = {key: content[key] for key in CARD}, content["weights"]
-        policy = make_policy(card["policy"], ROBOTS[card["robot"]], TASKS[card["task"]], card["scan"])
-        policy.load_state_dict({name: x.float() if x.is_floating_point() else x for name, x in weights.items()})
+        card = {key: content[key] for key in CARD}
+        name, task, scan = card["policy"], TASKS[card["task"]], card["scan"]
+        policy = make_policy(name, ROBOTS[card["robot"]], task, scan)
+        policy.load_state_dict(content["weights"])  # as float32, whatever the file has
     except (KeyError, TypeError, AttributeError, RuntimeError) as error:
         why = " ".join(str(error).split())[:200]
-        raise CheckpointError(f"{path} does not fit this program ({why}): train it again") from error
+        raise CheckpointError(f"{path} does not fit this program ({why}): train again") from error
     if robot is not None and card["robot"] != robot:
-        raise CheckpointError(f"{path} was trained on the {card['robot']}, not on the {robot}: say so with --robot")
+        raise CheckpointError(f"{path} was trained on the {card['robot']}, not on the {robot}")
     if bad := [name for name, x in policy.state_dict().items() if not torch.isfinite(x).all()]:
         raise CheckpointError(f"{path} is of no use: {bad[0]} is not finite")
     return policy.eval(), card
 
 
 def start_from(path: str | Path, policy: torch.nn.Module, critic: torch.nn.Module) -> None:
-    """Puts the weights in the file into a fresh policy and, if it is a checkpoint.pt, into a fresh
-    critic.
-
-    The file may be of a policy without the scan: inputs that it did not have come last, and their
-    weights start at 0, so that nothing changes at first. CheckpointError if the file cannot be
-    used.
-    """
+    """Puts the file's weights into a fresh policy and, those of a checkpoint.pt, a fresh critic. If
+    they are of a policy without the scan: inputs that it did not have come last, and their weights
+    start at 0, so that nothing changes at first. CheckpointError if the file cannot be used."""
     content = load(path)
     try:
         for module, saved in ((policy, content["weights"]), (critic, content.get("critic", {}))):
             own = module.state_dict()
-            if saved.keys() - own.keys():
-                raise KeyError(f"{min(saved.keys() - own.keys())} is unknown")
             for name, x in saved.items():
                 if x.shape != own[name].shape:  # (outputs, inputs)
                     x = torch.cat([x, torch.zeros(len(x), own[name].shape[1] - x.shape[1])], dim=1)
@@ -98,7 +86,7 @@ def start_from(path: str | Path, policy: torch.nn.Module, critic: torch.nn.Modul
             module.load_state_dict(own)
     except (KeyError, TypeError, AttributeError, IndexError, RuntimeError) as error:
         why = " ".join(str(error).split())[:200]
-        raise CheckpointError(f"the weights in {path} do not fit this policy ({why}): start from one of its own") from error
+        raise CheckpointError(f"the weights in {path} do not fit this policy ({why})") from error
 
 
 if __name__ == "__main__":
@@ -106,7 +94,7 @@ if __name__ == "__main__":
         sys.exit("usage: python checkpoint.py POLICY COPY")
     try:
         content = load(sys.argv[1])
-        weights = {name: x.half() if x.dim() > 1 else x for name, x in content["weights"].items()}
+        weights = {k: x.half() if x.dim() > 1 else x for k, x in content["weights"].items()}
         save({key: content[key] for key in CARD} | {"weights": weights}, Path(sys.argv[2]))
     except (CheckpointError, KeyError, OSError) as error:
         sys.exit(f"error: {error}")

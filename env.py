@@ -1,13 +1,10 @@
 """N legged robots in MuJoCo, each with a fault of its own; much like a Gymnasium vector env.
 
 The simulator is `mujoco.batch.Batch`; this file adds what the paper's section III and legged_gym
-define around it: observations, commands, resets, pushes, terminations. Rewards are in rewards.py,
-faults in faults.py, the ground in terrain.py, the scandots and their noise in noise.py.
+define around it: observations, commands, resets, pushes, terminations.
 
 Legend: N robots, L legs, J joints a leg, H = 10 steps of history. Numpy, float32 out.
-
 What a policy sees (`Observation`); the numbers are those of J = 3 joints a leg:
-
     symbol     shape            meaning                                                     scale
     legs       (N, L, H, 21)    s^l of eq. 1: what each leg saw in the past 10 steps, oldest first
       0:3                       joint angle beyond the default pose, hip thigh calf [rad]   4
@@ -19,35 +16,25 @@ What a policy sees (`Observation`); the numbers are those of J = 3 joints a leg:
       18:21                     direction of gravity in the trunk's frame, less (0, 0, -1)  5
     action     (N, L*J)         a_{t-1} of eq. 2: the previous actions of all legs          1
 
-All of it is in *leg frames*: what a left leg sees and does is mirrored to the right, so that the
-same number means the same motion and the same push on every leg, and what one leg learns holds on
-the other side, too. Right legs, such as the first one, see the trunk's own numbers. The scales make
-a walk's numbers about 1.
-
-What only some read is empty, (N, 0), unless named in `extras`; `privileged` is for critics and
-RMA's base:
-
+All of it is in *leg frames*: what a left leg sees and does is mirrored, so that a number means the
+same motion and push on every leg, and what one leg learns holds on the other side, too (NOTES 1).
+Right legs, such as the first one, see the trunk's own numbers. Scaled, a walk's are about 1.
+What only some read (`privileged`: critics, RMA's base) is empty, (N, 0), unless in `extras`:
     privileged (N, 2*L*J + 1)   is the joint locked, its motor's strength, the friction     1
     heights    (N, 16, 12)      s_e: trunk z - 0.5 m - ground z at the scandots, +-1 m      5
     past       (N, L, 50, 21)   as `legs`, 50 steps long                                    as above
     situation  (N, 1)           index of the robot's fault among the env's `faults`         1
 
-What rewards and users may read after a step (attributes; copy what you keep, some are the env's own
-memory; of a robot whose episode has ended all but the contacts are the next episode's):
-
+What rewards and users may read after a step (attributes; copy what you keep, some are the env's
+memory; of a robot whose episode has ended, all but the contacts are the next episode's):
     command, linear_velocity, angular_velocity, gravity (N, 3)  as above, unscaled
-    joint_error, joint_velocity, torque (N, L, J)               rad, rad/s, N m, in the URDF's frames
+    joint_error, joint_velocity, torque (N, L, J)               rad, rad/s, N m, in URDF frames
     action, last_action (N, L, J)                               in leg frames
     link_contact (N, L*links with a capsule), foot_contact, touchdown (N, L) bool; air_time (N, L) s
     position (N, 3) m, yaw (N,) rad                             the trunk in the world
-
-    >>> env = LocomotionEnv("a1", num_envs=4)
-    >>> observation = env.reset()
-    >>> observation, reward, terminated, truncated, info = env.step(np.zeros((4, env.num_actions)))
 """
 
 from dataclasses import asdict, dataclass
-from typing import NamedTuple
 
 import mujoco
 import numpy as np
@@ -57,45 +44,40 @@ from faults import Fault, healthy, props, write_fault
 from noise import NoisyScan, ScanNoise
 from rewards import FALL, total_reward
 from robots import PHYSICS_DT, ROBOTS, Robot, build_model
+from rolt import HISTORY, Observation
 from terrain import Terrain
 
-mujoco.set_mju_user_warning(lambda message: None)  # divergences are counted below, not logged to a file
-
+mujoco.set_mju_user_warning(lambda message: None)  # counted in `_diverged`, not logged
 SUBSTEPS = 4  # legged_gym: 50 Hz control
 CONTROL_DT = SUBSTEPS * PHYSICS_DT  # s
-HISTORY = 10  # steps (paper, section III-A)
 LONG_HISTORY = 50  # steps that RMA's adaptation reads (Kumar et al. 2021)
-JOINT_SCALE = np.array([[4.0], [0.2], [1.0]])  # angle, velocity, action; ours, as the next line (NOTES)
-TRUNK_SCALE = np.repeat((2.0, 2.0, 1.0, 5.0), 3)  # command, linear velocity, angular velocity, gravity
+JOINT_SCALE = np.array([[4.0], [0.2], [1.0]])  # angle, velocity, action; ours (NOTES 2)
+TRUNK_SCALE = np.repeat((2.0, 2.0, 1.0, 5.0), 3)  # command, velocities, gravity; ours, likewise
 # A mirror in the trunk's x-z plane changes the sign of a velocity's y, and of a turn's x and z.
 MIRROR = np.array([1, -1, -1, 1, -1, 1, -1, 1, -1, 1, -1, 1])
-MAX_ACTION = 10.0  # ours: 2.5 rad (hexapod: 1.5) from the default pose, far beyond what walking needs
-MAX_SPEED = 1000.0  # m/s, rad/s, ours: flailing at the motors' limits reaches 100; beyond it ran away
-MAX_TILT = np.cos(np.deg2rad(60))  # ours: past 60 degrees none gets up again; legged_gym waits for contact
+MAX_ACTION = 10.0  # ours: 2.5 rad (hexapod: 1.5) off the default pose, far more than walking needs
+MAX_SPEED = 1000.0  # m/s, rad/s, ours: flailing at the motors' limits reaches 100
+MAX_TILT = np.cos(np.deg2rad(60))  # ours: past it none gets up again; legged_gym waits for contact
 EXTRAS = ("privileged", "heights", "past", "situation")
 SAVED = (
-    "action", "last_action", "history", "command", "heading", "air_time", "age", "first_age", "command_age",
-    "episode_return", "fault_index", "_last_contact", "row", "start",
+    "action", "last_action", "history", "command", "heading", "air_time", "age", "first_age",
+    "command_age", "episode_return", "fault_index", "_last_contact", "row", "start",
 )  # fmt: skip
 
 
 @dataclass(frozen=True)
 class EnvConfig:
-    """All that training, tests and pictures ask differently of the same env. Ranges are (low,
-    high), uniform."""
+    """What training, tests and pictures ask differently of it. Ranges are (low, high), uniform."""
 
-    leg_frames: bool = True  # left legs see and act mirrored; False = the URDF's frames, our No Leg Frames
+    leg_frames: bool = True  # left legs are mirrored; False = the URDF's frames, our No Leg Frames
     episode_seconds: float = 20.0  # legged_gym, and the paper's tests
-    # s that a command lasts, through falls, until the next reset after that; ours (NOTES;
-    # legged_gym: 10)
-    command_seconds: float = 20.0
-    # m/s; ours: the tests walk forward, and to stand earns nothing (NOTES; legged_gym: -1 to 1)
-    forward_speed: tuple[float, float] = (0.3, 1.0)
-    lateral_speed: tuple[float, float] = (0.0, 0.0)  # m/s; ours, likewise
-    heading: tuple[float, float] = (-0.5, 0.5)  # rad, legged_gym's heading mode; ours: enough to hold a course
-    friction: tuple[float, float] = (0.5, 1.25)  # legged_gym, drawn once a robot there, here at every reset
+    command_seconds: float = 20.0  # through falls, until a reset; ours (NOTES 9; legged_gym: 10)
+    forward_speed: tuple[float, float] = (0.3, 1.0)  # m/s, ours (NOTES 5; legged_gym: -1 to 1)
+    lateral_speed: tuple[float, float] = (0.0, 0.0)  # m/s, ours: the tests walk forward
+    heading: tuple[float, float] = (-0.5, 0.5)  # rad; ours: enough to hold a course
+    friction: tuple[float, float] = (0.5, 1.25)  # legged_gym: once a robot; here at every reset
     start_pose: tuple[float, float] = (0.5, 1.5)  # times the default joint angles, legged_gym
-    start_speed: float = 0.5  # m/s and rad/s, each component of the trunk's velocity within +-, legged_gym
+    start_speed: float = 0.5  # m/s and rad/s, the trunk's velocities within +-, legged_gym
     push_seconds: float = 15.0  # legged_gym: then the trunk's velocity is redrawn
     push_speed: float = 1.0  # m/s, x and y within +-, legged_gym; 0 = no pushes
     start_rows: int = 3  # of the terrain, on which robots begin, ours (legged_gym: 6 of 10)
@@ -105,45 +87,27 @@ class EnvConfig:
         for name, value in asdict(self).items():
             low, high = value if isinstance(value, tuple) else (0, value)
             if not -np.inf < low <= high < np.inf:
-                raise ValueError(f"{name} is {value}; ranges are (low, high), all numbers finite, single ones >= 0")
+                raise ValueError(f"{name} is {value}; ranges: (low, high), others >= 0, all finite")
             if name.endswith("_seconds") and value < CONTROL_DT:
                 raise ValueError(f"{name} is {value}; a control step already lasts {CONTROL_DT} s")
-
-
-class Observation(NamedTuple):
-    """See the table at the head of this file. Fields are arrays here and tensors in the learner."""
-
-    legs: np.ndarray
-    action: np.ndarray
-    privileged: np.ndarray
-    heights: np.ndarray
-    past: np.ndarray
-    situation: np.ndarray
 
 
 class LocomotionEnv:
     """N robots of one kind; robot i's episode ends, and is restarted by `step`, on its own.
 
-    faults: (probability, fault) pairs; each reset draws one. `pin_faults` fixes one a robot
-        instead. Boxes and skates are there only if one of `faults` needs them.
     num_threads: of the simulator, 0 = one a core. Results do not depend on it.
+    faults: (probability, fault) pairs; each reset draws one. Only their boxes and skates exist.
     extras: which of `EXTRAS` the observation holds. None of them changes the simulation.
     terrain: None = flat ground. Robot i stays on column i modulo the number of columns.
     noise: on the scandots, for tests; from a generator of its own, so that it changes nothing else.
     """
 
     def __init__(
-        self,
-        robot: str | Robot,
-        num_envs: int,
-        seed: int | tuple[int, ...] = 0,
-        num_threads: int = 0,
-        faults: tuple[tuple[float, Fault], ...] = ((1.0, healthy()),),
-        config: EnvConfig = EnvConfig(),
-        extras: tuple[str, ...] = (),
-        terrain: Terrain | None = None,
-        noise: ScanNoise = ScanNoise(),
-    ):
+        self, robot: str | Robot, num_envs: int, seed: int | tuple[int, ...] = 0,
+        num_threads: int = 0, faults: tuple[tuple[float, Fault], ...] = ((1.0, healthy()),),
+        config: EnvConfig = EnvConfig(), extras: tuple[str, ...] = (),
+        terrain: Terrain | None = None, noise: ScanNoise = ScanNoise(),
+    ):  # fmt: skip
         if isinstance(robot, str) and robot not in ROBOTS:
             raise ValueError(f"unknown robot {robot!r}; there is {', '.join(ROBOTS)}")
         if num_envs < 1:
@@ -158,55 +122,49 @@ class LocomotionEnv:
         self.rng = np.random.default_rng(seed)
         self.terrain, self.scan = terrain, NoisyScan(num_envs, terrain, noise, seed)
 
-        self.model = build_model(robot, terrain, **props([fault for _, fault in faults]))
-        self.world = Batch(self.model, nsim=num_envs, nthread=num_threads, persistent=True)
-        self._qpos, self._qvel, self._ctrl = (self.world.bind(name) for name in ("qpos", "qvel", "ctrl"))
-        self._torque, self._contacts = self.world.bind("actuator_force"), self.world.bind("sensordata")
-        self._friction = self.world.expand("geom_friction")
-        names = [self.model.sensor(i).name.removeprefix("contact_") for i in range(self.model.nsensor)]
-        self._trunk_sensor = [names.index("trunk")]
+        self.faults = [fault for _, fault in faults]
+        self._fault_odds = np.array([probability for probability, _ in faults])
+        self.model = model = build_model(robot, terrain, **props(self.faults))
+        self.world = world = Batch(model, nsim=num_envs, nthread=num_threads, persistent=True)
+        self._qpos, self._qvel, self._ctrl = map(world.bind, ("qpos", "qvel", "ctrl"))
+        self._torque, self._contacts = map(world.bind, ("actuator_force", "sensordata"))
+        self._friction = world.expand("geom_friction")
+        names = [model.sensor(i).name.removeprefix("contact_") for i in range(model.nsensor)]
+        self._trunk_sensor = names.index("trunk")
         self._foot_sensors = [names.index(f"{leg}_foot") for leg in robot.legs]
         self._link_sensors = [i for i, name in enumerate(names) if name in robot.joints]
-        self._joints = np.array([self.model.joint(name).id for name in robot.joints])  # (L*J,), without wheels
-        self._angle_at = self.model.jnt_qposadr[self._joints]
-        self._velocity_at = self.model.jnt_dofadr[self._joints]
+        self._joints = joints = np.array([model.joint(name).id for name in robot.joints])  # (L*J,)
+        self._angle_at, self._velocity_at = model.jnt_qposadr[joints], model.jnt_dofadr[joints]
         self._default = np.array(robot.default_pose)  # (L, J)
 
-        # Leg frames. A mount with y > 0 is of a left leg. In its mirror image a turn about y stays
-        # as it is, and one about x or z turns the other way; so do the numbers of MIRROR. All signs
-        # 1 are the frames of the URDF.
+        # Leg frames: a mount with y > 0 is a left leg's. In its mirror image a turn about y stays
+        # as it is, and one about x or z turns the other way. All signs 1 are the URDF's frames.
         left = (np.array([y for _, y, _ in robot.mounts]) > 0) & config.leg_frames  # (L,)
         turned = np.array([link.axis[1] == 0 for link in robot.links])  # (J,)
         self._joint_sign = np.where(left[:, None] & turned, -1.0, 1.0)  # (L, J)
         self._trunk_sign = np.where(left[:, None], MIRROR, 1.0)  # (L, 12)
 
-        self.faults = [fault for _, fault in faults]
-        self._fault_odds = np.array([probability for probability, _ in faults])
-        self._pinned, self.fault_index = False, np.zeros(num_envs, dtype=int)  # (N,) which of `faults` each has
+        self._pinned, self.fault_index = False, np.zeros(num_envs, dtype=int)  # in `faults`
         shape = (num_envs, self.num_legs, self.num_joints)
         memory = LONG_HISTORY if "past" in extras else HISTORY
-        self.history = np.zeros((*shape[:2], memory, 12 + 3 * self.num_joints), dtype=np.float32)
+        self.history = np.zeros((*shape[:2], memory, 3 * self.num_joints + 12), dtype=np.float32)
         self.action, self.last_action = np.zeros(shape), np.zeros(shape)
-        self.command, self.heading = np.zeros((num_envs, 3)), np.zeros(num_envs)
         self.air_time, self._last_contact = np.zeros(shape[:2]), np.zeros(shape[:2], dtype=bool)
+        self.command, self.heading = np.zeros((num_envs, 3)), np.zeros(num_envs)
         # (N,) steps: since the reset, of which not lived (`random_ages`), since the command
         self.age, self.first_age, self.command_age = np.zeros((3, num_envs), dtype=int)
         self.episode_return = np.zeros(num_envs)
-        self.row, self.start = np.zeros(num_envs, dtype=int), np.zeros((num_envs, 2))  # where it began, m
+        self.row, self.start = np.zeros(num_envs, dtype=int), np.zeros((num_envs, 2))  # m
         self.column = np.arange(num_envs) % (len(terrain.columns) if terrain else 1)
 
-    # ------------------------------------------------------------------ interface
-
     def pin_faults(self, faults: list[Fault]) -> None:
-        """Robot i has faults[i] from its next reset on, in every episode (for tests: one a
-        robot)."""
+        """Robot i has faults[i] in every episode from its next reset on, for tests."""
         if len(faults) != self.num_envs:
             raise ValueError(f"{len(faults)} faults for {self.num_envs} robots")
         self.faults, self.fault_index, self._pinned = list(faults), np.arange(self.num_envs), True
 
     def reset(self, random_ages: bool = False) -> Observation:
-        """Starts an episode on every robot. `random_ages` spreads their ends in time (legged_gym,
-        for training)."""
+        """Starts an episode on every robot. `random_ages`: their ends are spread (legged_gym)."""
         everyone = np.arange(self.num_envs)
         self._resample_commands(everyone)
         if self.terrain:
@@ -218,35 +176,30 @@ class LocomotionEnv:
             self.age[:] = self.first_age[:] = self.command_age[:] = ages
         return self.observe()
 
-    def step(self, action: np.ndarray) -> tuple[Observation, np.ndarray, np.ndarray, np.ndarray, dict]:
-        """One control step of 20 ms: the joint targets are default pose + action_scale * action, in
-        leg frames.
-
-        Args:
-            action: (N, L*J) or (N, L, J), clipped to +-10. ValueError for other shapes, FloatingPointError for NaN.
-        Returns:
-            observation: Observation; of a robot whose episode ended, the first one of its next episode.
+    def step(self, action: np.ndarray) -> tuple:
+        """One control step of 20 ms, to joint targets default pose + action_scale * action. Actions
+        are (N, L*J) or (N, L, J), in leg frames, and are clipped to +-10. Returns:
+            observation: of a robot whose episode ended, the first one of its next episode.
             reward: (N,) float32.
-            terminated: (N,) bool, the robot fell (trunk on the ground, tilt over 60 degrees) or its simulation
-                diverged.
+            terminated: (N,) bool, fallen (trunk on the ground, tilt over 60 degrees) or diverged.
             truncated: (N,) bool, the time was up.
-            info: of the state that the step led to, before any reset: "rewards" {term: (N,)}
-                weighted, per second, "position" (N, 3) m, "speed" and "commanded_speed" forward
-                (N,) m/s, "diverged" (N,) bool. Of time-outs: "truncated_ids" (n,) and
-                "final_observation" (n rows), the true last observations to bootstrap from. Of all n
-                finished episodes: "episode_returns" and "episode_lengths" (n,), in steps.
+            info: of the state before any reset: "rewards" {term: (N,)} weighted, per second,
+                "position" (N, 3) m, "speed" and "commanded_speed" forward (N,) m/s, "diverged" (N,)
+                bool; of time-outs "truncated_ids" (n,) and "final_observation" (n rows) to
+                bootstrap from; of all ended "episode_returns", "episode_lengths" (n,), in steps.
         """
         if not hasattr(self, "position"):
             raise RuntimeError("the env has no state yet: call reset() before the first step")
         action = np.asarray(action, dtype=np.float64)
-        if action.shape not in ((self.num_envs, self.num_actions), self.action.shape):
-            raise ValueError(f"actions are ({self.num_envs}, {self.num_actions}), not {action.shape}")
+        flat = (self.num_envs, self.num_actions)
+        if action.shape not in (flat, self.action.shape):
+            raise ValueError(f"actions are {flat}, not {action.shape}")
         action = action.reshape(self.action.shape)
         if not np.isfinite(action).all():
-            raise FloatingPointError("an action is not finite: the policy that made it has diverged")
+            raise FloatingPointError("an action is not finite: its policy has diverged")
         self.last_action, self.action = self.action, np.clip(action, -MAX_ACTION, MAX_ACTION)
-        targets = self._default + self.robot.action_scale * self._joint_sign * self.action  # (N, L, J) rad
-        self._ctrl[:] = targets.reshape(self.num_envs, -1)
+        target = self._default + self.robot.action_scale * self._joint_sign * self.action  # rad
+        self._ctrl[:] = target.reshape(flat)
         self.world.step(nstep=SUBSTEPS, stage=mujoco.mjtStage.mjSTAGE_VEL)
         self.age += 1
         self.command_age += 1
@@ -255,9 +208,8 @@ class LocomotionEnv:
         self._read_state()
         self._read_feet()
         reward, terms = total_reward(self, CONTROL_DT)
-        fallen = (self._contacts[:, self._trunk_sensor] > 0).any(axis=1) | (self.gravity[:, 2] > -MAX_TILT)
-        reward += FALL * fallen
-        reward[diverged] = 0.0
+        fallen = (self._contacts[:, self._trunk_sensor] > 0) | (self.gravity[:, 2] > -MAX_TILT)
+        reward = np.where(diverged, 0.0, reward + FALL * fallen)
         self.episode_return += reward
         terminated = fallen | diverged
         truncated = (self.age >= self.episode_steps) & ~terminated
@@ -270,13 +222,12 @@ class LocomotionEnv:
         self.history[:, :, :-1] = self.history[:, :, 1:]
         self.history[:, :, -1] = self._frame()
 
-        ended = np.flatnonzero(terminated | truncated)
-        info["truncated_ids"] = np.flatnonzero(truncated)
-        info["final_observation"] = self.observe(info["truncated_ids"])
+        ended, late = np.flatnonzero(terminated | truncated), np.flatnonzero(truncated)
+        info |= {"truncated_ids": late, "final_observation": self.observe(late)}
         info["episode_returns"] = self.episode_return[ended].copy()
         info["episode_lengths"] = (self.age - self.first_age)[ended]
         if len(ended):
-            self._climb(ended[~diverged[ended]])  # whose position is none
+            self._climb(ended[~diverged[ended]])  # a diverged one is nowhere
             self._reset(ended)
         return self.observe(), reward.astype(np.float32), terminated, truncated, info
 
@@ -296,7 +247,24 @@ class LocomotionEnv:
             extra["situation"] = self.fault_index[ids, None].astype(np.float32)
         return Observation(history[:, :, -HISTORY:].copy(), action, **extra)
 
-    # ------------------------------------------------------------------ episode
+    def state_dict(self) -> dict:
+        """All that the next step depends on, but for noise on the scan, which is for tests."""
+        arrays = {name: getattr(self, name).copy() for name in SAVED}
+        arrays |= {"world": self.world.state.copy(), "friction": self._friction.copy()}
+        return arrays | {"random": self.rng.bit_generator.state}
+
+    def load_state_dict(self, state: dict) -> None:
+        """The inverse, for an env of the same arguments and the same pinned faults."""
+        for name in SAVED:
+            getattr(self, name)[...] = state[name]
+        self.rng.bit_generator.state = state["random"]
+        for index in np.unique(self.fault_index):
+            ids = np.flatnonzero(self.fault_index == index)
+            write_fault(self.faults[index], self.robot, self.world, ids)
+        self._friction[...] = state["friction"]
+        self.world.state[...] = state["world"]
+        self.world.forward(stage=mujoco.mjtStage.mjSTAGE_VEL)
+        self._read_state()
 
     def _reset(self, ids: np.ndarray) -> None:
         """New episodes for the robots `ids`: pose, velocity, friction, fault, command."""
@@ -304,17 +272,17 @@ class LocomotionEnv:
         self.world.reset(ids, keyframe=0, stage=mujoco.mjtStage.mjSTAGE_NONE)
         if not self._pinned:
             self.fault_index[ids] = self.rng.choice(len(self.faults), size=n, p=self._fault_odds)
-        pose = self._default * self.rng.uniform(*config.start_pose, size=(n, self.num_legs, self.num_joints))
-        velocity = self.rng.uniform(-config.start_speed, config.start_speed, size=(n, 6))
+        pose = self._default * self.rng.uniform(*config.start_pose, size=(n, *self._default.shape))
+        self._qvel[ids, :6] = self.rng.uniform(-config.start_speed, config.start_speed, size=(n, 6))
         self._friction[ids, :, 0] = self.rng.uniform(*config.friction, size=(n, 1))
         for index in np.unique(self.fault_index[ids]):
-            write_fault(self.faults[index], self.robot, self.world, ids[self.fault_index[ids] == index])
+            same = ids[self.fault_index[ids] == index]
+            write_fault(self.faults[index], self.robot, self.world, same)
 
         locked = self.world.bind("eq_active")[ids] > 0
         limits = self.world.expand("jnt_range")[ids][:, self._joints]
         pose = np.clip(pose.reshape(n, -1), limits[:, :, 0], limits[:, :, 1])
         self._qpos[ids[:, None], self._angle_at] = np.where(locked, self._default.reshape(-1), pose)
-        self._qvel[ids, :6] = velocity
         if self.terrain:
             self.start[ids] = self.terrain.start(self.row[ids], self.column[ids])
             self.start[ids, 1] += self.rng.uniform(-1, 1, size=n)  # m to the side, legged_gym
@@ -322,12 +290,11 @@ class LocomotionEnv:
         self.scan.draw(ids)
         self.world.forward(ids, stage=mujoco.mjtStage.mjSTAGE_VEL)
 
-        self.action[ids] = self.last_action[ids] = 0.0
-        self.air_time[ids], self._last_contact[ids] = 0.0, False
-        self.age[ids] = self.first_age[ids] = 0
-        self.episode_return[ids] = 0.0
+        self.action[ids] = self.last_action[ids] = self.air_time[ids] = self._last_contact[ids] = 0
+        self.age[ids] = self.first_age[ids] = self.episode_return[ids] = 0
         self._read_state()
-        self._resample_commands(ids[self.command_age[ids] >= round(config.command_seconds / CONTROL_DT)])
+        old = self.command_age[ids] >= round(config.command_seconds / CONTROL_DT)
+        self._resample_commands(ids[old])
         self._steer()
         self.history[ids] = self._frame()[ids, :, None]  # as though it had always stood like this
 
@@ -340,10 +307,9 @@ class LocomotionEnv:
 
     def _resample_commands(self, ids: np.ndarray) -> None:
         """A forward and a lateral speed, and a heading, for each of the robots `ids`."""
-        n = len(ids)
-        self.command[ids, 0] = self.rng.uniform(*self.config.forward_speed, size=n)
-        self.command[ids, 1] = self.rng.uniform(*self.config.lateral_speed, size=n)
-        self.heading[ids] = self.rng.uniform(*self.config.heading, size=n)
+        self.command[ids, 0] = self.rng.uniform(*self.config.forward_speed, size=len(ids))
+        self.command[ids, 1] = self.rng.uniform(*self.config.lateral_speed, size=len(ids))
+        self.heading[ids] = self.rng.uniform(*self.config.heading, size=len(ids))
         self.command_age[ids] = 0
 
     def _steer(self) -> None:
@@ -352,44 +318,21 @@ class LocomotionEnv:
         self.command[:, 2] = np.clip(0.5 * error, -1.0, 1.0)
 
     def _push(self) -> None:
-        due, speed = self.age % round(self.config.push_seconds / CONTROL_DT) == 0, self.config.push_speed
+        due = self.age % round(self.config.push_seconds / CONTROL_DT) == 0
+        speed = self.config.push_speed
         if speed > 0 and due.any():
             self._qvel[due, :2] = self.rng.uniform(-speed, speed, size=(int(due.sum()), 2))
 
     def _diverged(self) -> np.ndarray:
-        """(N,) bool, simulations that MuJoCo warns about (it has reset most of them) or whose state
-        ran away; afterwards all states are finite."""
-        tame = (np.abs(self._qvel).max(axis=1) < MAX_SPEED) & np.isfinite(self._qpos).all(axis=1)  # NaN is not <
+        """(N,) bool: MuJoCo warns (it resets most such) or it ran away. All states finite after."""
+        slow = np.abs(self._qvel).max(axis=1) < MAX_SPEED  # NaN is not <
+        tame = slow & np.isfinite(self._qpos).all(axis=1)
         if not tame.all():
             self.world.reset(np.flatnonzero(~tame), keyframe=0, stage=mujoco.mjtStage.mjSTAGE_VEL)
         return ~tame | (self.world.warning[:, :, 1] > 0).any(axis=1)
 
-    # ------------------------------------------------------------------ going on after a break
-
-    def state_dict(self) -> dict:
-        """All that the next step depends on, but for noise on the scan, which is for tests."""
-        arrays = {name: getattr(self, name).copy() for name in SAVED}
-        arrays |= {"world": self.world.state.copy(), "friction": self._friction.copy()}
-        return arrays | {"random": self.rng.bit_generator.state}
-
-    def load_state_dict(self, state: dict) -> None:
-        """The inverse of `state_dict`, for an env made with the same arguments and pinned to the
-        same faults."""
-        for name in SAVED:
-            getattr(self, name)[...] = state[name]
-        self.rng.bit_generator.state = state["random"]
-        for index in np.unique(self.fault_index):
-            write_fault(self.faults[index], self.robot, self.world, np.flatnonzero(self.fault_index == index))
-        self._friction[...] = state["friction"]
-        self.world.state[...] = state["world"]
-        self.world.forward(stage=mujoco.mjtStage.mjSTAGE_VEL)
-        self._read_state()
-
-    # ------------------------------------------------------------------ state
-
     def _read_state(self) -> None:
-        """MuJoCo's state in the terms of the table above. A free joint's velocity is linear in the
-        world's frame, angular in the body's."""
+        """The table's terms. qvel is linear in the world's frame and angular in the trunk's."""
         shape = self.action.shape
         w, x, y, z = self._qpos[:, 3:7].T
         self.position = self._qpos[:, :3].copy()
@@ -407,8 +350,7 @@ class LocomotionEnv:
         self.link_contact = self._contacts[:, self._link_sensors] > 0
 
     def _read_feet(self) -> None:
-        """Contacts, held for one step: a foot that leaves the ground for a single one has not taken
-        a step (legged_gym). A touchdown is a contact of a foot that was in the air."""
+        """Contacts are held for a step: a foot in the air for one has not stepped (legged_gym)."""
         contact = self._contacts[:, self._foot_sensors] > 0
         self.foot_contact = contact | self._last_contact
         self._last_contact = contact
@@ -417,16 +359,17 @@ class LocomotionEnv:
 
     def _frame(self) -> np.ndarray:
         """(N, L, 21), the newest step of every leg's history."""
-        shape = (self.num_envs, self.num_legs, -1)
-        angle, velocity = self._joint_sign * self.joint_error, self._joint_sign * self.joint_velocity
+        angle = self._joint_sign * self.joint_error
+        velocity = self._joint_sign * self.joint_velocity
         joints = JOINT_SCALE * np.stack([angle, velocity, self.action], axis=2)  # (N, L, 3, J)
-        upright = self.gravity - (0, 0, -1)
-        trunk = [self.command, self.linear_velocity, self.angular_velocity, upright]
-        trunk = TRUNK_SCALE * np.concatenate(trunk, axis=1)  # (N, 12)
-        return np.concatenate([joints.reshape(shape), trunk[:, None] * self._trunk_sign], axis=2, dtype=np.float32)
+        trunk = [self.command, self.linear_velocity, self.angular_velocity]
+        trunk = TRUNK_SCALE * np.concatenate([*trunk, self.gravity - (0, 0, -1)], axis=1)  # (N, 12)
+        parts = joints.reshape(*self.action.shape[:2], -1), trunk[:, None] * self._trunk_sign
+        return np.concatenate(parts, axis=2, dtype=np.float32)
 
     def _privileged(self) -> np.ndarray:
         """(N, 2*L*J + 1), what no robot can measure."""
         locked = self.world.bind("eq_active")
-        strength = self.world.expand("actuator_forcerange")[:, :, 1] / self.model.actuator_forcerange[:, 1]
-        return np.concatenate([locked, strength, self._friction[:, 0, :1]], axis=1, dtype=np.float32)
+        force = self.world.expand("actuator_forcerange")[:, :, 1]
+        motors = force / self.model.actuator_forcerange[:, 1]
+        return np.concatenate([locked, motors, self._friction[:, 0, :1]], axis=1, dtype=np.float32)

@@ -1,4 +1,4 @@
-"""PPO with consistent dropout (paper, section III-C; Schulman et al. 2017; Hausknecht, Wagener 2022).
+"""PPO with consistent dropout (paper, III-C; Schulman et al. 2017; Hausknecht, Wagener 2022).
 
 One iteration is three phases, in this order in the file:
     collect         the policy acts for T steps; its dropout masks are stored with every transition
@@ -6,9 +6,8 @@ One iteration is three phases, in this order in the file:
     Learner.update  epochs of minibatches through ppo_loss, with the stored masks replayed
 
 PPO's ratio is pi_new(a|s) / pi_old(a|s). With dropout the policy that acted is pi_old(a|s, mask):
-so the mask is part of what is remembered, as s and a are. On the first minibatch of an update no
-weight has moved, hence the ratio is exactly 1; with fresh masks it is not, and PPO would correct
-differences that are only the dice of the dropout.
+so the mask is remembered, as s and a are. On the first minibatch of an update no weight has moved,
+and the ratio is exactly 1; with fresh masks it is not, and PPO would correct the dropout's dice.
 
 Legend: T steps, N robots of this process, B samples of a minibatch, A actions of a robot.
 """
@@ -20,28 +19,23 @@ import torch.distributed as dist
 from torch import Tensor, nn
 from torch.distributions import Normal, kl_divergence
 
-from env import LocomotionEnv, Observation
-from rolt import Masks
+from rolt import Masks, Observation
 
 
 @dataclass(frozen=True)
 class PPOConfig:
     steps: int = 24  # T, control steps of an iteration, legged_gym
-    # ours: 1 of 12 minibatches of 1024 samples at 512 robots (legged_gym: 5 of 4, of 24576 at
-    # 4096). At this size the gradient is mostly noise: of what an update gained on its own rollout,
-    # fresh rollouts of the same policy saw a tenth. New samples cost a laptop little more than old
-    # ones, and do not repeat their noise.
-    epochs: int = 1
-    minibatches: int = 12
+    epochs: int = 1  # ours (legged_gym: 5): new samples do not repeat the old ones' noise (NOTES 6)
+    minibatches: int = 12  # ours: of 1024 samples at 512 robots (legged_gym: 4 of 24576 at 4096)
     discount: float = 0.99  # gamma, legged_gym
     gae_lambda: float = 0.95  # legged_gym
     clip: float = 0.2  # legged_gym
-    entropy_weight: float = 0.005  # ours: legged_gym's 0.01 keeps sigma from shrinking within a short run
+    entropy_weight: float = 0.005  # ours: at legged_gym's 0.01 a short run's sigma stays large
     value_weight: float = 1.0  # legged_gym
     max_gradient_norm: float = 1.0  # legged_gym
-    learning_rate: float = 1e-4  # at the start, ours: at legged_gym's 1e-3 a transformer jumps before the rule reacts
-    target_kl: float = 0.01  # legged_gym: the policy's learning rate follows it (see adapt_learning_rate)
-    critic_learning_rate: float = 1e-3  # legged_gym's at the start; it has no KL to follow
+    learning_rate: float = 1e-4  # first, ours: at 1e-3 a transformer jumps before the rule reacts
+    target_kl: float = 0.01  # legged_gym: the policy's rate follows it, `adapt_learning_rate`
+    critic_learning_rate: float = 1e-3  # legged_gym's first; it has no KL to follow
 
 
 def network(*sizes: int) -> nn.Sequential:
@@ -51,37 +45,34 @@ def network(*sizes: int) -> nn.Sequential:
 
 
 def proprioception(legs: Tensor) -> Tensor:
-    """(B, L, H, 3J + 12) -> (B, H * (L*3J + 12)): what each leg sees of itself, and of the trunk
-    once, as the first leg does."""
-    return torch.cat([legs[..., :-12].transpose(1, 2).flatten(2), legs[:, 0, :, -12:]], dim=2).flatten(1)
+    """(B, L, H, 3J + 12) -> (B, H * (L*3J + 12)): all legs' joints, and the first leg's trunk."""
+    joints = legs[..., :-12].transpose(1, 2).flatten(2)  # (B, H, L*3J)
+    return torch.cat([joints, legs[:, 0, :, -12:]], dim=2).flatten(1)
 
 
 class Critic(nn.Module):
-    """V(s), the same for all methods: an MLP [512, 256, 128] ELU (legged_gym), without dropout.
-
-    It is there in training only, so it sees what no policy does: what is wrong with the robot, and
-    clean heights (an asymmetric critic, Pinto et al. 2018).
-    """
+    """V(s), the same for all methods: an MLP [512, 256, 128] ELU (legged_gym), without dropout. It
+    is there in training only, so it sees what no policy does: what is wrong with the robot, and
+    clean heights (an asymmetric critic, Pinto et al. 2018; NOTES 10)."""
 
     def __init__(self, observation: Observation):
         super().__init__()
-        self.network = network(self.inputs(to_tensors(observation, "cpu")).shape[1], 512, 256, 128, 1)
+        inputs = self.inputs(to_tensors(observation, "cpu")).shape[1]
+        self.network = network(inputs, 512, 256, 128, 1)
 
     def inputs(self, observation: Observation) -> Tensor:
-        parts = proprioception(observation.legs), observation.privileged, observation.heights.flatten(1)
-        return torch.cat(parts, dim=1)
+        heights = observation.heights.flatten(1)
+        return torch.cat([proprioception(observation.legs), observation.privileged, heights], dim=1)
 
     def forward(self, observation: Observation) -> Tensor:
-        """(B,) value of each observation."""
-        return self.network(self.inputs(observation)).squeeze(1)
+        return self.network(self.inputs(observation)).squeeze(1)  # (B, 1) -> (B,)
 
 
 # ---------------------------------------------------------------------- collect
 
 
 class RolloutBuffer:
-    """T x N transitions, allocated once. `masks[name]` holds what the policy drew for each of them:
-    its dropout masks."""
+    """T x N transitions, allocated once; `masks` has the dropout masks that were drawn for each."""
 
     def __init__(self, T: int, observation: Observation, num_actions: int, masks: Masks, device):
         N = len(observation.legs)
@@ -91,11 +82,11 @@ class RolloutBuffer:
 
         self.observation = Observation(*(zeros(*field.shape[1:]) for field in observation))
         self.action, self.mean = zeros(num_actions), zeros(num_actions)
-        self.std = torch.zeros(num_actions, device=device)  # one for all: it does not depend on the state
+        self.std = torch.zeros(num_actions, device=device)  # one for all states
         self.log_prob, self.value, self.next_value, self.reward = zeros(), zeros(), zeros(), zeros()
         self.terminated, self.truncated = zeros(dtype=torch.bool), zeros(dtype=torch.bool)
         self.advantage, self.returns = zeros(), zeros()
-        self.masks = {name: zeros(*mask.shape[1:], dtype=mask.dtype) for name, mask in masks.items()}
+        self.masks = {name: zeros(*m.shape[1:], dtype=m.dtype) for name, m in masks.items()}
 
     def __len__(self) -> int:
         return self.reward.numel()
@@ -104,13 +95,13 @@ class RolloutBuffer:
         """The samples `index` (B,) of the flattened T*N, ready for `Learner.loss`."""
         names = ("action", "mean", "log_prob", "value", "advantage", "returns")
         batch = {name: getattr(self, name).flatten(0, 1)[index] for name in names}
-        batch["observation"] = Observation(*(field.flatten(0, 1)[index] for field in self.observation))
         batch["masks"] = {name: mask.flatten(0, 1)[index] for name, mask in self.masks.items()}
-        return batch
+        observation = (field.flatten(0, 1)[index] for field in self.observation)
+        return batch | {"observation": Observation(*observation)}
 
 
 def gaussian(mean: Tensor, std: Tensor) -> Normal:
-    """Unchecked: a NaN is caught where its name is known, in `Learner.update`."""
+    """Unchecked: `Learner.update` names what is not finite, before it reaches a weight."""
     return Normal(mean, std, validate_args=False)
 
 
@@ -119,19 +110,17 @@ def to_tensors(observation: Observation, device) -> Observation:
 
 
 def mean_action(policy, observation: Observation, masks: Masks | None, bf16: bool) -> Tensor:
-    """(B, A), with the matrix products of the hidden layers in bfloat16 if asked for: in rollout
-    and update alike."""
+    """(B, A), hidden layers in bfloat16 if asked for: in rollout and update alike (NOTES 13)."""
     with torch.autocast(observation.legs.device.type, torch.bfloat16, enabled=bf16):
         return policy(observation, masks)
 
 
 @torch.no_grad()
 def collect(
-    env: LocomotionEnv, policy, critic: Critic, buffer: RolloutBuffer, observation: Observation,
+    env, policy, critic: Critic, buffer: RolloutBuffer, observation: Observation,
     generator: torch.Generator, bf16: bool = False,
 ) -> tuple[Observation, list[dict]]:  # fmt: skip
-    """T steps of every robot into `buffer`. Returns the observation to go on from and each step's
-    info."""
+    """T steps of every robot into `buffer`. Returns the observation to go on from, all infos."""
     device, infos = buffer.reward.device, []
     buffer.std.copy_(policy.std())
     for t in range(len(buffer.reward)):
@@ -149,14 +138,15 @@ def collect(
 
         observation, reward, terminated, truncated, info = env.step(action.cpu().numpy())
         buffer.reward[t] = torch.from_numpy(reward)
-        buffer.terminated[t], buffer.truncated[t] = torch.from_numpy(terminated), torch.from_numpy(truncated)
+        buffer.terminated[t] = torch.from_numpy(terminated)
+        buffer.truncated[t] = torch.from_numpy(truncated)
         buffer.next_value[t] = 0
-        if len(info["truncated_ids"]):  # the next observation in the buffer is of another episode: ask the true one
+        if len(info["truncated_ids"]):  # the next one here is of another episode: ask the true one
             ids = torch.from_numpy(info["truncated_ids"]).to(device)
             buffer.next_value[t, ids] = critic(to_tensors(info["final_observation"], device))
         infos.append(info)
-    last_value = critic(to_tensors(observation, device))
-    following = torch.cat([buffer.value[1:], last_value[None]])
+
+    following = torch.cat([buffer.value[1:], critic(to_tensors(observation, device))[None]])
     buffer.next_value = torch.where(buffer.truncated, buffer.next_value, following)
     return observation, infos
 
@@ -165,13 +155,13 @@ def collect(
 
 
 def compute_gae(
-    reward: Tensor, value: Tensor, next_value: Tensor, terminated: Tensor, truncated: Tensor, gamma: float, lam: float
-) -> Tensor:
+    reward: Tensor, value: Tensor, next_value: Tensor,
+    terminated: Tensor, truncated: Tensor, gamma: float, lam: float,
+) -> Tensor:  # fmt: skip
     """Generalised advantage estimation (Schulman et al. 2016), all (T, N) -> (T, N).
 
-    next_value[t] is V of the state that step t led to, before any reset. A termination has no
-    future: its value does not count. A time-out has one that we stop watching: its value counts,
-    but no later step's advantage does.
+    next_value[t] is V of where step t led to, before any reset. A termination has no future: V does
+    not count. A time-out has one that we stop watching: V counts, but no later advantage does.
     """
     advantage, running = torch.zeros_like(reward), torch.zeros_like(reward[0])
     delta = reward + gamma * next_value * ~terminated - value  # the TD error
@@ -186,10 +176,7 @@ def ppo_loss(
     value: Tensor, old_value: Tensor, returns: Tensor,
     entropy: Tensor, entropy_weight: float, config: PPOConfig,
 ) -> tuple[Tensor, dict[str, Tensor]]:  # fmt: skip
-    """The clipped surrogate loss, the clipped value loss and the entropy bonus; all inputs (B,).
-
-    Returns the mean loss, and what it is made of.
-    """
+    """Clipped surrogate and value loss, entropy bonus; inputs (B,). Returns the mean, its parts."""
     ratio = (log_prob - old_log_prob).exp()
     clipped = ratio.clamp(1 - config.clip, 1 + config.clip)
     surrogate = -torch.min(ratio * advantage, clipped * advantage).mean()
@@ -201,13 +188,8 @@ def ppo_loss(
 
 
 def adapt_learning_rate(rate: float, kl: float, target: float) -> float:
-    """legged_gym's rule: slower when the policy moved too far, faster when it hardly moved.
-
-    Applied once an update, to the mean KL of its minibatches. legged_gym applies it after each of
-    its minibatches of 24576; after each of ours, where KL is 0 at first and noisy then, the rate
-    swung between 1e-5 and 5e-4, and the surrogate gained a third of what it gains at the same KL
-    with a steady rate.
-    """
+    """legged_gym's rule: slower when the policy moved too far, faster when it hardly moved. Once an
+    update, not after each minibatch: there KL is 0 at first and noisy then (NOTES 7)."""
     if kl > 2 * target:
         return max(1e-5, rate / 1.5)
     return min(1e-2, rate * 1.5) if 0 < kl < target / 2 else rate
@@ -228,22 +210,17 @@ def num_processes() -> int:
 
 
 class Learner:
-    """Policy, critic and optimiser. Each process holds a copy and its own samples; gradients are
-    averaged over all.
-
-    Trains the parameters that require a gradient. The baselines' later stages (baselines.py)
-    override `loss`.
-    """
+    """Policy, critic and optimiser; a copy in each process, which has its own samples. Trains the
+    parameters that require a gradient. Later stages of baselines (baselines.py) override `loss`."""
 
     def __init__(self, policy, critic: nn.Module, config: PPOConfig, bf16: bool = False):
         self.policy, self.critic, self.config, self.bf16 = policy, critic, config, bf16
-        named = [*policy.named_parameters(), *((f"critic.{n}", p) for n, p in critic.named_parameters())]
-        self.parameters = {name: p for name, p in named if p.requires_grad}
-        groups = [
-            {"params": [p for p in policy.parameters() if p.requires_grad], "lr": config.learning_rate},
-            {"params": [p for p in critic.parameters() if p.requires_grad], "lr": config.critic_learning_rate},
-        ]
-        self.optimizer = torch.optim.Adam(groups, fused=True)
+        actor = {name: p for name, p in policy.named_parameters() if p.requires_grad}
+        values = {f"critic.{name}": p for name, p in critic.named_parameters() if p.requires_grad}
+        self.parameters = actor | values
+        actor_group = {"params": list(actor.values()), "lr": config.learning_rate}
+        critic_group = {"params": list(values.values()), "lr": config.critic_learning_rate}
+        self.optimizer = torch.optim.Adam([actor_group, critic_group], fused=True)
         self.learning_rate = config.learning_rate  # the policy's
 
     def state_dict(self) -> dict:
@@ -253,13 +230,9 @@ class Learner:
         self.optimizer.load_state_dict(state["optimizer"])
         self.learning_rate = state["learning_rate"]
 
-    def update(self, buffer: RolloutBuffer, generator: torch.Generator, progress: float = 0.0) -> dict[str, float]:
+    def update(self, buffer: RolloutBuffer, generator: torch.Generator, progress=0.0) -> dict:
         """PPO's epochs on one rollout. progress: of the training, 0 to 1. Returns the means of
-        `loss`'s figures over all minibatches.
-
-        Raises FloatingPointError with the name of the first tensor that is not finite, before it
-        reaches a weight.
-        """
+        `loss`'s figures. Raises FloatingPointError before what is not finite reaches a weight."""
         config = self.config
         buffer.advantage = compute_gae(
             buffer.reward, buffer.value, buffer.next_value, buffer.terminated, buffer.truncated,
@@ -282,16 +255,17 @@ class Learner:
                 for name, value in stats.items():
                     totals[name] = totals.get(name, 0.0) + value.detach()
 
-        means = all_reduce(torch.stack(list(totals.values()))) / (config.epochs * config.minibatches * num_processes())
+        count = config.epochs * config.minibatches * num_processes()
+        means = all_reduce(torch.stack(list(totals.values()))) / count
         stats = dict(zip(totals, means.tolist()))
         if "kl" in stats:
-            self.learning_rate = adapt_learning_rate(self.learning_rate, stats["kl"], config.target_kl)
-            self.optimizer.param_groups[0]["lr"] = self.learning_rate
+            rate = adapt_learning_rate(self.learning_rate, stats["kl"], config.target_kl)
+            self.learning_rate = self.optimizer.param_groups[0]["lr"] = rate
         return stats
 
-    def loss(self, batch: dict, old_std: Tensor, progress: float) -> tuple[Tensor, dict[str, Tensor]]:
-        """The mean loss of a minibatch, and what it is made of."""
-        mean = mean_action(self.policy, batch["observation"], batch["masks"], self.bf16)  # the rollout's masks, replayed
+    def loss(self, batch: dict, old_std: Tensor, progress: float) -> tuple[Tensor, dict]:
+        """The mean loss of a minibatch, and its parts. The rollout's masks are replayed."""
+        mean = mean_action(self.policy, batch["observation"], batch["masks"], self.bf16)
         old, new = gaussian(batch["mean"], old_std), gaussian(mean, self.policy.std())
         loss, stats = ppo_loss(
             new.log_prob(batch["action"]).sum(-1), batch["log_prob"], batch["advantage"],
@@ -304,20 +278,22 @@ class Learner:
         """Over all processes, in one message."""
         if dist.is_initialized():
             gradients = [p.grad for p in self.parameters.values()]
-            flat = all_reduce(torch.cat([gradient.flatten() for gradient in gradients])) / num_processes()
-            for gradient, part in zip(gradients, flat.split([gradient.numel() for gradient in gradients])):
-                gradient.copy_(part.view_as(gradient))
+            flat = all_reduce(torch.cat([g.flatten() for g in gradients])) / num_processes()
+            for g, part in zip(gradients, flat.split([g.numel() for g in gradients])):
+                g.copy_(part.view_as(g))
 
     def _clip_gradients(self) -> None:
         norm = nn.utils.clip_grad_norm_(self.parameters.values(), self.config.max_gradient_norm)
         if not torch.isfinite(norm):
-            bad = [name for name, p in self.parameters.items() if not torch.isfinite(p.grad).all()] or ["the loss"]
-            raise FloatingPointError(f"training has diverged: the gradient of {bad[0]} is not finite")
+            bad = [n for n, p in self.parameters.items() if not torch.isfinite(p.grad).all()]
+            name = bad[0] if bad else "the loss"
+            raise FloatingPointError(f"training has diverged: the gradient of {name} is not finite")
 
 
 def normalise(advantage: Tensor) -> Tensor:
     """Zero mean and unit deviation over the samples of all processes."""
     x = advantage.double()
-    count, total, squares = all_reduce(torch.stack([torch.full_like(x, 1.0).sum(), x.sum(), (x**2).sum()]))
+    sums = torch.stack([torch.full_like(x, 1.0).sum(), x.sum(), (x**2).sum()])
+    count, total, squares = all_reduce(sums)
     mean = total / count
     return ((x - mean) / ((squares / count - mean**2).clamp(min=0).sqrt() + 1e-8)).float()

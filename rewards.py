@@ -1,23 +1,20 @@
 """The nine rewards of the paper's Table I, each a function of the env's state.
 
-Every function takes the env (see the attribute table in env.py) and returns (N,), one number a
-robot. The weights are the paper's; the definitions that the table leaves open are legged_gym's,
-which the paper trained with. As there, the weighted sum is multiplied by the control period and
-floored at zero, so that early on, when all goes wrong, falling at once is never better than trying.
-
-Legend: N robots, L legs, J joints a leg.
+Every function takes the env (see the attribute table in env.py) and returns (N,), a number a
+robot. The weights are the paper's; what the table leaves open is legged_gym's, which the paper
+trained with. As there, the weighted sum is multiplied by the control period and floored at zero, so
+that early on, when all goes wrong, falling at once is never better than trying.
 """
 
 import numpy as np
 
 TRACKING_SIGMA = 0.25  # (m/s)^2 and (rad/s)^2, legged_gym; the paper names sigma without a value
 AIR_TIME_TARGET = 0.5  # s, legged_gym
-MOVING_COMMAND = 0.1  # m/s, legged_gym: a robot told to stand still is not paid for lifting its feet
+MOVING_COMMAND = 0.1  # m/s, legged_gym: one told to stand still is not paid for lifting its feet
 
 
 def xy_velocity_tracking(env) -> np.ndarray:
-    """exp(-|v_xy - v_cmd|^2 / sigma). Table I prints no square; without one, too slow would pay
-    more than exact."""
+    """exp(-|v_xy - v_cmd|^2 / sigma). Table I has no square: too slow would pay more than exact."""
     error = env.linear_velocity[:, :2] - env.command[:, :2]
     return np.exp(-np.sum(error**2, axis=1) / TRACKING_SIGMA)
 
@@ -38,8 +35,7 @@ def roll_pitch_velocity(env) -> np.ndarray:
 
 
 def collision(env) -> np.ndarray:
-    """The number of links with a capsule (thighs, calves, a hexapod's hips) that touch the ground:
-    legged_gym's sum of the table's indicator."""
+    """How many links with a capsule touch the ground: legged_gym's sum of the table's indicator."""
     return np.sum(env.link_contact, axis=1)
 
 
@@ -54,8 +50,7 @@ def action_rate(env) -> np.ndarray:
 
 
 def foot_air_time(env) -> np.ndarray:
-    """Sum over feet that touch down of (t_air - 0.5 s): long steps pay, short ones cost
-    (legged_gym's form)."""
+    """Sum over feet that touch down of (t_air - 0.5 s): short steps cost (legged_gym's form)."""
     moving = np.linalg.norm(env.command[:, :2], axis=1) > MOVING_COMMAND
     return moving * np.sum(env.touchdown * (env.air_time - AIR_TIME_TARGET), axis=1)
 
@@ -78,11 +73,7 @@ REWARDS = {
     joint_error: -0.04,
 }
 
-
-# Added for a fall, once, after the floor. Ours: legged_gym has such a term, -4 for its Cassie and 0
-# for its A1. With 0 and the few robots of a laptop, ROLT found that to lunge forward, fall and be
-# put up again pays as much as to stand; it still did after 0.9 million steps.
-FALL = -1.0
+FALL = -1.0  # ours, for a fall, once, after the floor: lunging must not pay (NOTES 8)
 
 
 def total_reward(env, dt: float) -> tuple[np.ndarray, dict[str, np.ndarray]]:

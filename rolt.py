@@ -1,37 +1,45 @@
-"""ROLT, the robust locomotion transformer: the paper's section III in one file, which needs torch
-alone.
+"""ROLT, the robust locomotion transformer: the paper's section III in one file; needs torch only.
 
 Where each equation is:
     eq. 1  e^l = MLP(s^l)             `leg_embedding`, one network for all legs
-    eq. 2  e^a = W a_{t-1} + b        `action_embedding`, by which the legs find out which one they are
-    eq. 3  e^prop = [e^l..., e^a]     `tokens`, followed by the 12 height patches e^h = linear(s^h) + p_e
-    III-B  two encoder layers, linear decoder on the leg tokens        `EncoderLayer`, `forward`
-    III-C  feature dropout and position embedding (PE) dropout         `sample_masks`, `drop`, `tokens`
+    eq. 2  e^a = W a_{t-1} + b        `action_embedding`, by it a leg finds out which one it is
+    eq. 3  e^prop = [e^l..., e^a]     `tokens`, followed by the 12 patches e^h = linear(s^h) + p_e
+    III-B  two encoder layers, linear decoder on the leg tokens     `EncoderLayer`, `forward`
+    III-C  feature dropout, position embedding (PE) dropout         `sample_masks`, `drop`, `tokens`
 
 Why no position embedding on the legs: with one, each leg learns a controller of its own, and what
-the front right leg has learned about limping stays there. Without one the legs share everything;
-where a leg is on the robot it must find out by comparing its own previous action with the action
-token.
+the front right leg has learned about limping stays there. Without one the legs share everything; a
+leg finds out where it is by comparing its own previous action with the action token.
 
-Why the masks are data: PPO compares the policy that acted with the policy that is updated. Drawn
-anew in the update, dropout would make them differ before a single weight has moved. So the
-rollout's masks are stored with the transition and passed to `forward` again (ppo.py); None, at
-test, means no dropout.
+Why the masks are data: PPO compares the policy that acted with the one that is updated. Drawn anew,
+dropout would make them differ before a single weight has moved. So the rollout's masks are stored
+with the transition and passed to `forward` again (ppo.py); None, at test, means no dropout.
 
-Legend: B samples, L legs, J joints a leg, H steps of history, P = 12 patches, T = L + 1 + P tokens,
-D = 160 width. Observations are the tuple of env.py, as tensors: `legs` (B, L, H, 3J + 12), `action`
-(B, L*J), `heights` (B, 16, 12).
+Legend: B samples, L legs, J joints a leg, H = 10 steps of history, P = 12 patches, D = 160 width,
+T tokens: L, the action token, and P where the policy reads the scan.
 """
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
 
+HISTORY = 10  # H, steps (paper, section III-A)
 LOG_STD_BOUNDS = (math.log(0.05), math.log(2.0))  # ours
-
 Masks = dict[str, Tensor]  # what the policy drew in the rollout: name -> (B, ...) bool, True = keep
+
+
+class Observation(NamedTuple):
+    """What robots see; the table at the head of env.py says what each number is. Tensors here."""
+
+    legs: Tensor  # (B, L, H, 3J + 12)
+    action: Tensor  # (B, L*J)
+    privileged: Tensor  # (B, 2*L*J + 1), or (B, 0) as all that follows
+    heights: Tensor  # (B, 16, 12)
+    past: Tensor  # (B, L, 50, 3J + 12)
+    situation: Tensor  # (B, 1)
 
 
 @dataclass(frozen=True)
@@ -42,21 +50,18 @@ class ROLTConfig:
     layers: int = 2  # paper
     heads: int = 4  # ours: the paper names no number; 4 heads of 40
     feedforward: int = 320  # ours: twice the width keeps it light
-    history: int = 10  # H, paper
-    scan: bool = False  # does it read the height scan? On flat ground the scan says one number 192 times
+    scan: bool = False  # reads heights? Flat ground's are 192 times one number (NOTES 12)
     scan_shape: tuple[int, int] = (16, 12)  # points forward, left
     patch: int = 4  # points a side: 12 patches, as in the paper
-    initial_std: float = 1.0  # legged_gym (NOTES: from 0.7 the robots learn to stand first)
-    # Positions start as large as what they are added to, measured at the start (NOTES): smaller
-    # ones never come to life.
-    patch_position_std: float = 0.75
-    leg_position_std: float = 0.2
+    initial_std: float = 1.0  # legged_gym; from 0.7 the robots learn to stand first (NOTES 4)
+    patch_position_std: float = 0.75  # ours: as large as what it is added to (NOTES 3)
+    leg_position_std: float = 0.2  # ours, likewise
     feature_dropout: float = 0.1  # paper; 0 = the ablation No Feature Drop
     pe_dropout: float = 0.75  # paper; 0 = the ablation No PE Drop
     # How a leg knows which one it is: by the "action" token (the paper), a learned "embedding" a
     # leg (its ablation Module PE), or "none" (our control No Identity)
     identity: str = "action"
-    leg_frames: bool = True  # does it see and act in leg frames (env.py)? False = our ablation No Leg Frames
+    leg_frames: bool = True  # sees and acts in leg frames (env.py); False = our No Leg Frames
 
     @property
     def num_patches(self) -> int:
@@ -66,15 +71,13 @@ class ROLTConfig:
 
 
 def draw_mask(shape: tuple[int, ...], p: float, generator: torch.Generator) -> Tensor:
-    """Bools of this shape, False with probability p to within 2^-16. 16 random bits a decision:
-    half the time of torch.rand."""
-    bits = torch.empty(shape, dtype=torch.int16, device=generator.device).random_(generator=generator)  # 0 to 2^15 - 1
-    return bits >= round(p * 2**15)
+    """Bools, False with probability p to within 2^-16. int16 takes half the time of torch.rand."""
+    bits = torch.empty(shape, dtype=torch.int16, device=generator.device)
+    return bits.random_(generator=generator) >= round(p * 2**15)  # bits: 0 to 2^15 - 1
 
 
 def drop(x: Tensor, keep: Tensor | None, p: float) -> Tensor:
-    """Consistent dropout: a stored mask `keep` of x's shape, kept values scaled by 1 / (1 - p);
-    None = identity."""
+    """Consistent dropout: x where the stored mask is True, times 1 / (1 - p); None = identity."""
     return x if keep is None else x * keep * (1 / (1 - p))
 
 
@@ -92,31 +95,29 @@ class Decoder(nn.Linear):
 
 
 class EncoderLayer(nn.Module):
-    """Pre-norm transformer layer (ViT's; the paper names none) with dropout after attention and
-    after the MLP."""
+    """Pre-norm transformer layer (ViT's; the paper names none), dropout after attention and MLP."""
 
     def __init__(self, config: ROLTConfig):
         super().__init__()
-        D = config.width
+        D, hidden = config.width, config.feedforward
         assert D % config.heads == 0, "the width must be a multiple of the number of heads"
         self.heads, self.p = config.heads, config.feature_dropout
         self.norm_attention, self.norm_feedforward = nn.LayerNorm(D), nn.LayerNorm(D)
-        self.query, self.key_value, self.merge = nn.Linear(D, D), nn.Linear(D, 2 * D), nn.Linear(D, D)
-        self.feedforward = nn.Sequential(nn.Linear(D, config.feedforward), nn.ReLU(), nn.Linear(config.feedforward, D))
+        self.query, self.key_value = nn.Linear(D, D), nn.Linear(D, 2 * D)
+        self.merge = nn.Linear(D, D)
+        self.feedforward = nn.Sequential(nn.Linear(D, hidden), nn.ReLU(), nn.Linear(hidden, D))
 
-    def forward(self, x: Tensor, queries: int, keep_attention: Tensor | None, keep_feedforward: Tensor | None):
-        """Updates the first `queries` tokens only, from all of them.
+    def forward(self, x: Tensor, queries: int, keep_attention, keep_feedforward):
+        """Updates the first `queries` tokens of x (B, T, D); masks are (B, queries, D) or None.
 
-        What a token becomes depends on the other tokens' keys and values, never on their queries:
-        leaving out those that nobody reads afterwards changes nothing in the rest.
-
-        Args: x (B, T, D); masks (B, queries, D) or None.
+        To leave out those that nobody reads afterwards changes nothing in the rest: what a token
+        becomes depends on the other tokens' keys and values, never on their queries.
         Returns: tokens (B, queries, D), attention weights (B, heads, queries, T).
         """
         normed = self.norm_attention(x)
         x = x[:, :queries]
         q = self._split(self.query(normed[:, :queries]))  # (B, heads, queries, d)
-        k, v = (self._split(half) for half in self.key_value(normed).chunk(2, dim=-1))  # (B, heads, T, d)
+        k, v = (self._split(half) for half in self.key_value(normed).chunk(2, dim=-1))  # T long
         scores = q @ k.transpose(-2, -1) * q.shape[-1] ** -0.5
         weights = torch.softmax(scores.float(), dim=-1)  # (B, heads, queries, T)
         mixed = (weights.to(v.dtype) @ v).transpose(1, 2).flatten(2)  # (B, queries, D)
@@ -131,29 +132,30 @@ class EncoderLayer(nn.Module):
 
 
 class ROLT(nn.Module):
-    """Gaussian policy: the mean of every joint's action from the transformer, and a learned std a
-    kind of joint."""
+    """Gaussian policy: each action's mean from the transformer, a learned std a kind of joint."""
 
-    # what a policy tells train.py and evaluate.py of itself
-    replays_masks = True  # in the update
+    replays_masks = True  # in the update: what train.py and evaluate.py ask a policy
 
     def __init__(self, num_legs: int, num_joints: int, config: ROLTConfig = ROLTConfig()):
         super().__init__()
         self.config, self.num_legs, self.num_joints = config, num_legs, num_joints
-        self.extras = ("heights",) if config.scan else ()  # of the observation (env.py), that it reads
+        self.extras = ("heights",) if config.scan else ()  # that it reads, see env.py
         self.leg_frames = config.leg_frames
+
         D = config.width
-        frame = 3 * num_joints + 12  # numbers that one leg sees in one step
-        self.leg_embedding = nn.Sequential(nn.Linear(config.history * frame, D), nn.ReLU(), nn.Linear(D, D))
+        inputs = HISTORY * (3 * num_joints + 12)  # numbers that one leg sees
+        self.leg_embedding = nn.Sequential(nn.Linear(inputs, D), nn.ReLU(), nn.Linear(D, D))
         if config.identity == "embedding":
             self.leg_position = nn.Parameter(config.leg_position_std * torch.randn(num_legs, D))
         if config.identity == "action":
             self.action_embedding = nn.Linear(num_legs * num_joints, D)
         if config.scan:
+            P, std = config.num_patches, config.patch_position_std
             self.patch_embedding = nn.Linear(config.patch**2, D)
-            self.patch_position = nn.Parameter(config.patch_position_std * torch.randn(config.num_patches, D))  # p_e
+            self.patch_position = nn.Parameter(std * torch.randn(P, D))  # p_e
             if config.pe_dropout > 0:  # stands in for every dropped p_e
-                self.dropped_position = nn.Parameter(config.patch_position_std * torch.randn(D))
+                self.dropped_position = nn.Parameter(std * torch.randn(D))
+
         self.encoder = nn.ModuleList(EncoderLayer(config) for _ in range(config.layers))
         self.norm = nn.LayerNorm(D)
         self.decoder = Decoder(D, num_joints)
@@ -165,11 +167,11 @@ class ROLT(nn.Module):
         return self.log_std.clamp(*LOG_STD_BOUNDS).exp().repeat(self.num_legs)
 
     def sample_masks(self, n: int, generator: torch.Generator) -> Masks:
-        """Dropout masks for n samples: (n, P) patches that keep their p_e, (n, tokens, D) features
-        that are kept."""
+        """For n samples: (n, P) patches that keep their p_e, (n, tokens, D) features that stay."""
         config, masks = self.config, {}
         if config.scan and config.pe_dropout > 0:
-            masks["patch_position"] = draw_mask((n, config.num_patches), config.pe_dropout, generator)
+            shape = (n, config.num_patches)
+            masks["patch_position"] = draw_mask(shape, config.pe_dropout, generator)
         if config.feature_dropout > 0:
             for i in range(config.layers):
                 shape = (n, self._queries(i), config.width)
@@ -178,47 +180,46 @@ class ROLT(nn.Module):
         return masks
 
     def forward(self, observation, masks: Masks | None = None) -> Tensor:
-        """(B, L*J) mean action: J joint targets from each leg's token. masks: of `sample_masks`,
-        None = test."""
+        """(B, L*J) mean action, J from each leg's token. masks: of `sample_masks`; None = test."""
         x, _ = self._encode(observation, masks or {})
         return self.decoder(self.norm(x)).flatten(1)  # (B, L, J) -> (B, L*J)
 
     def attention(self, observation) -> Tensor:
-        """(B, layers, heads, L, T) weights that the leg tokens give to [legs, action, patches],
-        without dropout."""
+        """(B, layers, heads, L, T) attention of the legs to [legs, action, patches], at test."""
         _, attention = self._encode(observation, {})
         return torch.stack([weights[:, :, : self.num_legs] for weights in attention], dim=1)
 
     def tokens(self, observation, masks: Masks) -> Tensor:
         """E_0 = [e^prop, e^h], (B, T, D)."""
         config = self.config
-        legs = self.leg_embedding(observation.legs.flatten(2))  # (B, L, H*frame) -> (B, L, D), eq. 1
+        legs = self.leg_embedding(observation.legs.flatten(2))  # (B, L, H*21) -> (B, L, D), eq. 1
         tokens = [legs + self.leg_position if config.identity == "embedding" else legs]
         if config.identity == "action":
-            tokens.append(self.action_embedding(observation.action)[:, None])  # (B, L+1, D), eq. 2 and 3
+            tokens.append(self.action_embedding(observation.action)[:, None])  # (B, 1, D), eq. 2
 
         if config.scan:
+            # s = patch: (B, 4s, 3s) -> (B, 4, s, 3, s) -> (B, 4, 3, s, s) -> (B, P, s*s)
             rows, columns = (size // config.patch for size in config.scan_shape)
-            patches = observation.heights.unflatten(2, (columns, -1)).unflatten(1, (rows, -1))  # (B, 4, s, 3, s)
-            patches = self.patch_embedding(patches.transpose(2, 3).flatten(3).flatten(1, 2))  # (B, P, s*s) -> (B, P, D)
+            squares = observation.heights.unflatten(2, (columns, -1)).unflatten(1, (rows, -1))
+            patches = self.patch_embedding(squares.transpose(2, 3).flatten(3).flatten(1, 2))
             position = self.patch_position
             if "patch_position" in masks:
-                position = torch.where(masks["patch_position"][:, :, None], position, self.dropped_position)  # (B, P, D)
+                keep = masks["patch_position"][:, :, None]
+                position = torch.where(keep, position, self.dropped_position)  # (B, P, D)
             tokens.append(patches + position)
-        return torch.cat([part.float() for part in tokens], dim=1)
+        return torch.cat([part.float() for part in tokens], dim=1)  # eq. 3
 
     def _queries(self, layer: int) -> int:
-        """How many tokens a layer updates: all that the next one reads; after the last only the
-        legs are read."""
+        """How many tokens a layer updates: those read afterwards; after the last, only the legs."""
         if layer == self.config.layers - 1:
             return self.num_legs
         return self.num_legs + (self.config.identity == "action") + self.config.num_patches
 
     def _encode(self, observation, masks: Masks) -> tuple[Tensor, list[Tensor]]:
-        """The leg tokens after the last layer (B, L, D), and the attention weights of every
-        layer."""
+        """The leg tokens after the last layer (B, L, D), and every layer's attention weights."""
         x, attention = self.tokens(observation, masks), []
         for i, layer in enumerate(self.encoder):
-            x, weights = layer(x, self._queries(i), masks.get(f"attention_{i}"), masks.get(f"feedforward_{i}"))
+            keep = masks.get(f"attention_{i}"), masks.get(f"feedforward_{i}")
+            x, weights = layer(x, self._queries(i), *keep)
             attention.append(weights)
         return x, attention

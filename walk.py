@@ -1,11 +1,6 @@
-"""One walk of a policy, and what is measured of it: distance, falls, gait; and tables over cases
-and seeds.
+"""One walk of a policy, what is measured of it, and tables over cases and seeds.
 
-    >>> walk = take_a_walk(policy, "a1", [lock("FR_calf")] * 4, speed=0.75, seconds=20.0)
-    >>> walk.distance, walk.fall_time
-
-Tests, films, gaits and attention all use it: robots are told to walk straight on, nobody is pushed,
-starts vary as in training. Legend: N robots, T steps of 20 ms, L legs.
+Robots go straight on and unpushed; starts vary as in training. N robots, T steps of 20 ms, L legs.
 """
 
 import csv
@@ -28,8 +23,7 @@ def to_tensors(observation: Observation) -> Observation:
 
 
 def straight_ahead(policy, speed: float, seconds: float) -> EnvConfig:
-    """Straight on at `speed` m/s from the terrain's first row, without pushes or a time-out within
-    `seconds`."""
+    """Straight on at `speed` m/s from the terrain's first row, no push or time-out in `seconds`."""
     return EnvConfig(
         leg_frames=policy.leg_frames, episode_seconds=seconds + 1.0, forward_speed=(speed, speed),
         heading=(0.0, 0.0), push_speed=0.0, start_rows=1, climb=False,
@@ -49,22 +43,18 @@ class Walk(NamedTuple):
     returns: np.ndarray  # (N,) reward up to then
 
     @property
-    def fell(self) -> np.ndarray:
-        """(N,) bool"""
+    def fell(self) -> np.ndarray:  # (N,) bool
         return self.steps < len(self.poses)
 
 
 @torch.no_grad()
-def take_a_walk(
-    policy, robot: str, faults: list[Fault], speed: float, seconds: float, seed: int = 0, threads: int = 0, **env_options
-) -> Walk:
-    """Robot i with faults[i]. env_options: of LocomotionEnv, such as terrain and noise.
-
-    A fall is what ends an episode in training: the trunk touches the ground or tilts by more than
-    60 degrees, or the simulation diverges (that is said on stderr).
-    """
-    situations, config, N = [(1.0, fault) for fault in faults], straight_ahead(policy, speed, seconds), len(faults)
-    env = LocomotionEnv(robot, N, seed, threads, situations, config, policy.extras, **env_options)
+def take_a_walk(policy, robot, faults, speed, seconds, seed=0, threads=0, **env_options) -> Walk:
+    """Robot i with faults[i], at speed m/s. env_options: of LocomotionEnv, as terrain and noise. A
+    fall is what ends an episode in training: the trunk on the ground or tilted by more than 60
+    degrees, or a simulation that diverges (that is said on stderr)."""
+    N, situations = len(faults), [(1.0, fault) for fault in faults]
+    config, extras = straight_ahead(policy, speed, seconds), policy.extras
+    env = LocomotionEnv(robot, N, seed, threads, situations, config, extras, **env_options)
     env.pin_faults(faults)  # one each
     feet = [env.model.sensor(f"contact_{leg}_foot").adr[0] for leg in env.robot.legs]
     observation, poses, contacts = env.reset(), [], []
@@ -76,7 +66,7 @@ def take_a_walk(
         action = policy(to_tensors(observation)).numpy()
         observation, reward, terminated, _, info = env.step(action)
         divergences += (upright & info["diverged"]).sum()
-        valid = upright & ~info["diverged"]  # a diverged simulation's position means nothing: keep the last one
+        valid = upright & ~info["diverged"]  # a diverged position means nothing: keep the last one
         distance[valid] = info["position"][valid, 0] - start[valid]
         returns += upright * reward
         upright &= ~terminated
@@ -86,10 +76,8 @@ def take_a_walk(
     if divergences:
         print(f"simulations that diverged, counted as falls: {divergences}", file=sys.stderr)
     fall_time = np.where(upright, seconds, (steps + 1) * CONTROL_DT)
-    return Walk(env, list(faults), np.array(poses), np.array(contacts), steps, distance, fall_time, returns)
-
-
-# ---------------------------------------------------------------------- gaits
+    poses, contacts = np.array(poses), np.array(contacts)
+    return Walk(env, faults, poses, contacts, steps, distance, fall_time, returns)
 
 
 def without_chatter(contacts: np.ndarray) -> np.ndarray:
@@ -100,8 +88,7 @@ def without_chatter(contacts: np.ndarray) -> np.ndarray:
 
 
 def stride_frequency(contacts: np.ndarray, dt: float) -> np.ndarray:
-    """(L,) Hz: strides from a foot's first touchdown to its last one over the time they took; 0 for
-    less than one."""
+    """(L,) Hz: strides from a foot's first touchdown to its last over their time; 0 if none."""
     frequency = np.zeros(contacts.shape[1])
     for leg, foot in enumerate(contacts.T):
         touchdowns = np.flatnonzero(foot[1:] & ~foot[:-1])
@@ -111,64 +98,64 @@ def stride_frequency(contacts: np.ndarray, dt: float) -> np.ndarray:
 
 
 def gait(walk: Walk, i: int) -> dict[str, np.ndarray] | None:
-    """Of robot i, from WARM_UP to its first fall; None if that came too soon. (L,) the share of the
-    time that each foot is on the ground (above 0.5 in a walk, below in a run), (L,) strides a
-    second, () feet on the ground."""
+    """Of robot i, from WARM_UP to its first fall (None if too soon): (L,) share of the time on the
+    ground (above 0.5 in a walk, below in a run), (L,) strides a second, () feet on the ground."""
     steady = without_chatter(walk.contacts[: walk.steps[i], i])[round(WARM_UP / CONTROL_DT) :]
     if len(steady) * CONTROL_DT < SHORTEST:
         return None
-    feet_down = np.array(steady.sum(axis=1).mean())
-    return {"duty": steady.mean(axis=0), "stride_hz": stride_frequency(steady, CONTROL_DT), "feet_down": feet_down}
+    strides, feet_down = stride_frequency(steady, CONTROL_DT), np.array(steady.sum(axis=1).mean())
+    return {"duty": steady.mean(axis=0), "stride_hz": strides, "feet_down": feet_down}
 
 
-# ---------------------------------------------------------------------- walks over cases, and their tables
+def origin(path: Path, card: dict) -> dict:
+    """Which policy a row of a CSV file is about."""
+    return {"method": card["policy"], "seed": card["seed"], "checkpoint": str(path)}
 
 
 def walk_cases(args, policies, cases: dict[str, Fault], speed: float, **env_options) -> list[dict]:
-    """Every policy on every case, `args.episodes` robots each: the rows of the CSV file. Distance
-    is as walked; `share` is of the commanded distance, and no more than 1 (to run ahead is no
-    success)."""
-    faults = [fault for fault in cases.values() for _ in range(args.episodes)]
+    """Every policy on every case, `args.episodes` robots each: rows of the CSV file. Distance is as
+    walked; `share` is of the commanded distance, at most 1 (to run ahead is no success)."""
     labels = [(case, episode) for case in cases for episode in range(args.episodes)]
-    rows = []
+    faults = [cases[case] for case, _ in labels]
+    how, rows = (speed, args.seconds, args.seed, args.threads), []
     for path, (policy, card) in policies.items():
-        walk = take_a_walk(policy, args.robot, faults, speed, args.seconds, args.seed, args.threads, **env_options)
+        walk = take_a_walk(policy, args.robot, faults, *how, **env_options)
         for i, (case, episode) in enumerate(labels):
-            share, fell = min(1.0, walk.distance[i] / (speed * args.seconds)), bool(walk.fell[i])
-            numbers = {"distance_m": walk.distance[i], "share": share, "fall_time_s": walk.fall_time[i]}
-            numbers |= {"episode_return": walk.returns[i]}
-            row = {"method": card["policy"], "seed": card["seed"], "checkpoint": str(path), "case": case}
-            row |= {"episode": episode, "fell": int(fell), "success": int(share >= 0.5 and not fell)}
-            rows.append(row | {name: f"{value:.4f}" for name, value in numbers.items()})
+            share, fell = min(1.0, walk.distance[i] / (speed * args.seconds)), walk.fell[i]
+            rows.append(origin(path, card) | {
+                "case": case, "episode": episode, "fell": int(fell),
+                "success": int(share >= 0.5 and not fell), "distance_m": f"{walk.distance[i]:.4f}",
+                "share": f"{share:.4f}", "fall_time_s": f"{walk.fall_time[i]:.4f}",
+                "episode_return": f"{walk.returns[i]:.4f}",
+            })  # fmt: skip
         print(f"  {card['policy']}, seed {card['seed']}: done", flush=True)
     return rows
 
 
 def cell(rows: list[dict], method: str, case: str, column: str) -> tuple[float, float]:
-    """Mean over seeds of the mean over episodes, and the standard deviation over seeds (over
-    episodes if there is one)."""
+    """Mean over seeds of the mean over episodes; deviation over seeds (over episodes if one)."""
     mine = [row for row in rows if row["method"] == method and row["case"] == case]
-    seeds = [[float(row[column]) for row in mine if row["seed"] == seed] for seed in {row["seed"] for row in mine}]
+    seeds = [[float(r[column]) for r in mine if r["seed"] == s] for s in {r["seed"] for r in mine}]
     means = [np.mean(values) for values in seeds]
     return float(np.mean(means)), float(np.std(means) if len(means) > 1 else np.std(seeds[0]))
 
 
-def report(args, rows: list[dict], name: str, title: str, columns: dict[str, str], marks: dict[str, str] = {}) -> dict:
-    """Prints a table a column of the rows, writes the CSV file. columns: {column: what it is};
-    marks: {case: what to say of it}. Returns {what: {method: (means, deviations)}} for a chart."""
+def report(args, rows, name: str, title: str, columns: dict[str, str], marks={}) -> dict:
+    """Writes the CSV file, prints a table of each of the columns {column: what} and of the falls.
+    marks: {case: a remark}. Returns {what: {method: (means, deviations)}} for a chart."""
     write_csv(args.out / f"{name}.csv", rows)
     methods, cases = ([*dict.fromkeys(row[key] for row in rows)] for key in ("method", "case"))
-    panels = {what: {m: [*zip(*(cell(rows, m, case, c) for case in cases))] for m in methods} for c, what in columns.items()}
+    panels = {}
     print(f"\n{title}")
     for column, what in (columns | {"fell": "episodes with a fall"}).items():
         print(f"\n{what:22}" + "".join(f"{case + marks.get(case, ''):>15}" for case in cases))
+        panels[what] = {}
         for method in methods:
             pairs = [cell(rows, method, case, column) for case in cases]
-            share = column == "fell"
-            words = [f"{mean:.0%}" if share else f"{mean:.2f} ± {deviation:.2f}" for mean, deviation in pairs]
+            panels[what][method] = [*zip(*pairs)]
+            words = [f"{m:.0%}" if column == "fell" else f"{m:.2f} ± {d:.2f}" for m, d in pairs]
             print(f"{method:22}" + "".join(f"{word:>15}" for word in words))
-    print(f"\nwritten: {args.out / name}.csv and .png")
-    return panels
+    return {what: panels[what] for what in columns.values()}
 
 
 def write_csv(path: Path, rows: list[dict]) -> None:

@@ -1,18 +1,15 @@
-"""A trained policy to look at while it walks, with its fault, its command and its noise to change
-on the way; and films.
+"""A trained policy to look at while it walks, and to disturb on the way; and films.
 
-    python evaluate.py watch                                          # the A1, healthy
-    python evaluate.py watch --robot a1 --fault lock:FR_calf --speed 0.5
-    python evaluate.py watch --stairs 0 --noise offset:0.2            # steps of 5 cm (level 0), and scandots that lie
-    python evaluate.py watch --fault tow:RR --out tow.gif             # no viewer, a moving picture
-    python evaluate.py watch --fault healthy lock:FR_calf --out strip.png    # a row of frames a fault
+    python evaluate.py watch --fault lock:FR_calf --speed 0.5
+    python evaluate.py watch --stairs 0 --noise offset:0.2    # steps of 5 cm, scandots that lie
+    python evaluate.py watch --fault tow:RR --out tow.gif     # no viewer, a moving picture
+    python evaluate.py watch --fault healthy lock:FR_calf --out strip.png    # a row a fault
 
-Where there is a display, a window of MuJoCo's viewer opens: the keys up and down change the speed,
-left and right the fault. Elsewhere MuJoCo's browser viewer is served; its panel does the same. (It
-is open to everybody who can reach the port; from another machine it wants `ssh -L
-8080:localhost:8080`.) Either way the terminal takes the same words: a fault ("lock:RL_calf",
-"healthy"), a speed ("0.5"), noise ("sigma:0.1", "clean"), "again" to start over, "quit". A robot
-that falls starts over by itself.
+Where there is a display, a window opens: the keys up and down change the speed, left and right the
+fault. Elsewhere MuJoCo's browser viewer is served, with a panel for the same. (It is open to all
+who can reach the port; from another machine: `ssh -L 8080:localhost:8080`.) The terminal takes the
+same words: a fault (lock:RL_calf, healthy), a speed (0.5), noise (sigma:0.1, clean), "again" to
+start over, "quit". A robot that falls starts over by itself.
 """
 
 import argparse
@@ -32,17 +29,15 @@ from PIL import Image, ImageDraw
 
 from checkpoint import load_policy
 from env import CONTROL_DT, LocomotionEnv
-from faults import REAL_WORLD, TASKS, Fault, first_task, healthy, joint_mask, parse, props, write_fault
-from noise import ScanNoise
+from faults import REAL_WORLD, TASKS, Fault, first_task, joint_mask, parse, props, write_fault
 from noise import parse as parse_noise
 from robots import ROBOTS
 from terrain import Terrain
 from walk import Walk, straight_ahead, take_a_walk, to_tensors
 
-HELP = "type a fault (lock:RL_calf, healthy, ...), a speed (0.5), noise (sigma:0.1, clean, ...), again or quit"
-NO_DISPLAY = sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
-
-# ---------------------------------------------------------------------- pictures
+HELP = "type a fault (lock:RL_calf, healthy), a speed (0.5), noise (sigma:0.1), again or quit"
+DISPLAY = os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
+NO_DISPLAY = sys.platform == "linux" and not DISPLAY
 
 
 def painted(env: LocomotionEnv, fault: Fault) -> mujoco.MjModel:
@@ -56,9 +51,8 @@ def painted(env: LocomotionEnv, fault: Fault) -> mujoco.MjModel:
     return model
 
 
-def draw(walk: Walk, robot: int, steps: range, width: int = 480, height: int = 300) -> list[Image.Image]:
-    """Frames of one of the robots at these steps. RuntimeError with the way out where nothing can
-    be drawn."""
+def draw(walk: Walk, robot: int, steps: range, width=480, height=300) -> list[Image.Image]:
+    """Frames of one of the robots at these steps. RuntimeError if nothing can be drawn here."""
     if NO_DISPLAY and "MUJOCO_GL" not in os.environ:  # MuJoCo would look for a window
         from mujoco.egl import GLContext
         from mujoco.rendering.classic import gl_context
@@ -68,10 +62,12 @@ def draw(walk: Walk, robot: int, steps: range, width: int = 480, height: int = 3
     try:
         renderer = mujoco.Renderer(model, height, width)
     except Exception as error:  # each backend fails in its own way
-        raise RuntimeError(f"cannot draw ({error}): try MUJOCO_GL=egl (libegl1) or osmesa (libosmesa6)") from error
+        way_out = "try MUJOCO_GL=egl (libegl1) or osmesa (libosmesa6)"
+        raise RuntimeError(f"cannot draw ({error}): {way_out}") from error
     data, camera, frames = mujoco.MjData(model), mujoco.MjvCamera(), []
     camera.distance = 1.3 * max(1.0, walk.env.robot.trunk_box[0] / 0.38)  # m, the whole robot
-    camera.azimuth, camera.elevation = 60 if walk.env.terrain else 125, -18  # from behind, stairs show their steps
+    camera.elevation = -18
+    camera.azimuth = 60 if walk.env.terrain else 125  # from behind, stairs show their steps
     for step in steps:
         data.qpos[:] = walk.poses[step, robot]
         mujoco.mj_kinematics(model, data)
@@ -86,10 +82,10 @@ def draw(walk: Walk, robot: int, steps: range, width: int = 480, height: int = 3
 
 def write_gif(frames: list[Image.Image], path: Path, seconds_a_frame: float) -> None:
     """One palette for all frames keeps the file small and the colours still."""
-    palette = frames[0].quantize(64, Image.Quantize.FASTOCTREE)  # keeps the few red pixels of a fault red
-    images = [frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]
-    duration = max(20, round(1000 * seconds_a_frame))
-    images[0].save(path, save_all=True, append_images=images[1:], duration=duration, loop=0, optimize=True)
+    palette = frames[0].quantize(64, Image.Quantize.FASTOCTREE)  # keeps a fault's few pixels red
+    first, *rest = (frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames)
+    options = {"duration": max(20, round(1000 * seconds_a_frame)), "loop": 0, "optimize": True}
+    first.save(path, save_all=True, append_images=rest, **options)
 
 
 def write_strip(rows: dict[str, list[Image.Image]], path: Path) -> None:
@@ -105,48 +101,46 @@ def write_strip(rows: dict[str, list[Image.Image]], path: Path) -> None:
 
 def film(args, policy, faults: list[Fault], options: dict) -> None:
     """Writes --out: from 2 s on, up to the first fall."""
-    seconds, start = args.seconds or (4.0 if args.out.suffix == ".gif" else 0.6), round(2 / CONTROL_DT)
+    gif, start = args.out.suffix == ".gif", round(2 / CONTROL_DT)
+    seconds = args.seconds or (4.0 if gif else 0.6)
     walk = take_a_walk(policy, args.robot, faults, args.speed, 2 + seconds, args.seed, **options)
-    every = 2 if args.out.suffix == ".gif" else max(1, round(seconds / CONTROL_DT / 6))  # six frames in a strip
+    every = 2 if gif else max(1, round(seconds / CONTROL_DT / 6))  # six frames in a strip
     shown = {str(fault): range(start, walk.steps[i], every) for i, fault in enumerate(faults)}
     if fallen := [name for name, steps in shown.items() if not steps]:
-        raise RuntimeError(f"with {fallen[0]} the robot falls within 2 s: there is nothing to show")
-    if args.out.suffix == ".gif":
+        raise RuntimeError(f"with {fallen[0]} the robot falls within 2 s: nothing to show")
+    if gif:
         write_gif(draw(walk, 0, shown[str(faults[0])]), args.out, every * CONTROL_DT)
     else:
-        write_strip({name: draw(walk, i, steps, 300, 240) for i, (name, steps) in enumerate(shown.items())}, args.out)
+        films = [draw(walk, i, steps, 300, 240) for i, steps in enumerate(shown.values())]
+        write_strip(dict(zip(shown, films)), args.out)
     print(f"written: {args.out}")
 
 
-# ---------------------------------------------------------------------- live
-
-
 class Show:
-    """One robot that walks straight on for ever. `model` and `data` are what a viewer shows; they
-    are new objects after some changes. `said` is the answer to the last word."""
+    """One robot that walks straight on for ever. `model` and `data`, which a viewer shows, are new
+    objects after some changes. `said` is the answer to the last word."""
 
-    def __init__(self, policy, robot: str, fault: Fault, speed: float, seed: int, terrain: Terrain | None, noise: ScanNoise):
+    def __init__(self, policy, robot: str, fault: Fault, speed: float, seed: int, terrain, noise):
         self.policy, self.robot, self.speed, self.seed = policy, robot, speed, seed
         self.terrain, self.noise = terrain, noise
         task = TASKS[first_task(robot)]
-        self.menu = [fault for _, fault in task.training] + list(task.unseen)
-        self.menu += [fault for fault in REAL_WORLD.values() if "go1" in task.robots and fault not in self.menu]
+        self.menu = [*(fault for _, fault in task.training), *task.unseen]
+        if "go1" in task.robots:
+            self.menu += [fault for fault in REAL_WORLD.values() if fault not in self.menu]
         self.words, self.said, self.over = queue.Queue(), HELP, False
         self.start(fault)
 
     def start(self, fault: Fault) -> None:
-        """A new episode in a new env. ValueError if the robot has no such part; then all stays as
-        it was."""
+        """A new episode in a new env. ValueError if the robot has no such part; all stays then."""
         config = straight_ahead(self.policy, self.speed, 3600)
-        options = {"extras": self.policy.extras, "terrain": self.terrain, "noise": self.noise}
-        env = LocomotionEnv(self.robot, 1, self.seed, 1, [(1.0, fault)], config, **options)
+        options = (config, self.policy.extras, self.terrain, self.noise)
+        env = LocomotionEnv(self.robot, 1, self.seed, 1, [(1.0, fault)], *options)
         observation, model = env.reset(), painted(env, fault)
         self.env, self.observation, self.fault = env, observation, fault
         self.model, self.data = model, mujoco.MjData(model)
 
     def set_fault(self, fault: Fault) -> None:
-        """Without a fall or a reset, unless a box or wheels come or go. ValueError if the robot has
-        no such part."""
+        """Without a reset, unless a box or wheels come or go. ValueError: there is no such part."""
         if props([fault]) != props([self.fault]):
             return self.start(fault)
         write_fault(fault, self.env.robot, self.env.world, np.array([0]))
@@ -154,8 +148,7 @@ class Show:
         self.fault, self.model = fault, painted(self.env, fault)
 
     def hear(self, word: str) -> None:
-        """One of the words that HELP lists. What it cannot read changes nothing, and `said` tells
-        why."""
+        """A word of those in HELP. What it cannot read changes nothing, and `said` tells why."""
         try:
             if word == "quit":
                 self.over = True
@@ -200,8 +193,7 @@ class Clock:
 
 
 def desktop(show: Show) -> None:
-    """A window of mujoco.viewer, opened anew when a box or wheels come or go. Closing it ends the
-    show."""
+    """A window of mujoco.viewer, anew when a box or wheels come or go. Closing it ends the show."""
     import mujoco.viewer
 
     def key(code: int) -> None:  # GLFW's codes
@@ -221,7 +213,8 @@ def desktop(show: Show) -> None:
             while show.data is data and not (show.over or closed):
                 with viewer.lock():
                     show.step()
-                    model.geom_rgba[:] = show.model.geom_rgba if show.data is data else model.geom_rgba
+                    if show.data is data:
+                        model.geom_rgba[:] = show.model.geom_rgba
                     mujoco.mj_forward(model, data)
                 viewer.sync()
                 clock.wait()
@@ -229,8 +222,7 @@ def desktop(show: Show) -> None:
 
 
 def browser(show: Show, port: int) -> None:
-    """MuJoCo's viewer as a web page, with a panel of our own. port 0: the first free one from 8080
-    on."""
+    """MuJoCo's viewer as a web page, with a panel of our own. port 0: the first free from 8080."""
     from mujoco.studio import launch_web, messages, plugin, viewer_protocol
     from mujoco.studio.dear_imgui import dear_imgui as imgui
 
@@ -266,7 +258,8 @@ def browser(show: Show, port: int) -> None:
                     show.words.put("again")
             imgui.End()
 
-    config, clock = viewer_protocol.ViewerConfig(title=f"ROLT: {show.robot}", gfx="web", http_port=port), Clock()
+    title, clock = f"ROLT: {show.robot}", Clock()
+    config = viewer_protocol.ViewerConfig(title=title, gfx="web", http_port=port)
     with launch_web.launch(config, plugins=[Panel()]) as handle:
         while handle.is_running() and not show.over:
             show.step()
@@ -280,20 +273,20 @@ def track(camera) -> None:
 
 
 def main(argv: list[str] | None = None) -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter, usage=argparse.SUPPRESS
-    )
-    parser.add_argument("--robot", default="a1", choices=ROBOTS)
-    parser.add_argument("--checkpoint", type=Path, metavar="FILE", help="default: the shipped ROLT of the robot")
-    parser.add_argument("--fault", nargs="+", default=["healthy"], help="e.g. lock:FR_calf+weaken:RL:0.5; .png shows several")
-    parser.add_argument("--speed", type=float, default=0.75, help="commanded, m/s (default 0.75)")
-    parser.add_argument("--stairs", type=int, choices=range(-2, 11), metavar="LEVEL", help="-2 to 10, instead of flat ground")
-    parser.add_argument("--noise", default="clean", help="on the scandots, e.g. offset:0.2, sigma:0.1, missing:4")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--viewer", choices=("desktop", "browser"), help="default: desktop where there is a display")
-    parser.add_argument("--port", type=int, default=0, help="of the browser viewer (default: the first free from 8080 on)")
-    parser.add_argument("--out", type=Path, metavar="FILE", help="write a moving picture (.gif) or a strip of frames (.png)")
-    parser.add_argument("--seconds", type=float, help="of the picture (default 4, of a strip 0.6)")
+    plain = {"usage": argparse.SUPPRESS, "formatter_class": argparse.RawDescriptionHelpFormatter}
+    parser = argparse.ArgumentParser(description=__doc__, **plain)
+    add, levels = parser.add_argument, range(-2, 11)
+    add("--robot", default="a1", choices=ROBOTS)
+    add("--checkpoint", type=Path, metavar="FILE", help="default: the shipped ROLT of the robot")
+    add("--fault", nargs="+", default=["healthy"], help="lock:FR_calf+weaken:RL:0.5; .png: several")
+    add("--speed", type=float, default=0.75, help="commanded, m/s (default 0.75)")
+    add("--stairs", type=int, choices=levels, metavar="LEVEL", help="-2 to 10 (default: flat)")
+    add("--noise", default="clean", help="on the scandots: offset:0.2, sigma:0.1, missing:4")
+    add("--seed", type=int, default=0)
+    add("--viewer", choices=("desktop", "browser"), help="default: desktop if there is a display")
+    add("--port", type=int, default=0, help="of the browser viewer (default: the first from 8080)")
+    add("--out", type=Path, metavar="FILE", help="write a film (.gif) or a strip of frames (.png)")
+    add("--seconds", type=float, help="of the picture (default 4, of a strip 0.6)")
     args = parser.parse_args(argv)
     if args.out and args.out.suffix not in (".gif", ".png"):
         parser.error(f"--out is a .gif or a .png file, not {args.out}")
@@ -302,15 +295,15 @@ def main(argv: list[str] | None = None) -> None:
     torch.set_num_threads(1)
     try:
         task = first_task(args.robot) if args.stairs is None else "terrain"
-        shipped = Path(os.path.relpath(Path(__file__).parent)) / f"checkpoints/{args.robot}-{task}-rolt.pt"
-        policy, _ = load_policy(args.checkpoint or shipped, args.robot)
+        shipped = Path(__file__).parent / f"checkpoints/{args.robot}-{task}-rolt.pt"
+        policy, _ = load_policy(args.checkpoint or os.path.relpath(shipped), args.robot)
         faults, noise = [parse(text) for text in args.fault], parse_noise(args.noise)
         terrain = None if args.stairs is None else Terrain(("stairs",), (args.stairs,) * 9)
         if args.out:
             return film(args, policy, faults, {"terrain": terrain, "noise": noise})
         show = Show(policy, args.robot, faults[0], args.speed, args.seed, terrain, noise)
         print(HELP)
-        threading.Thread(target=lambda: [show.words.put(line) for line in sys.stdin], daemon=True).start()
+        threading.Thread(target=lambda: [*map(show.words.put, sys.stdin)], daemon=True).start()
         browser(show, args.port) if args.viewer == "browser" or NO_DISPLAY else desktop(show)
     except KeyboardInterrupt:
         pass

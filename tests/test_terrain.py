@@ -5,13 +5,15 @@ import numpy as np
 import pytest
 
 from env import EnvConfig, LocomotionEnv
-from noise import NoisyScan, ScanNoise, missing_points, parse, patch_shifts, point_shifts
+from noise import ScanNoise, as_patches, missing_points, parse, patch_shifts, point_shifts, scan
 from robots import A1, build_model
-from noise import as_patches, scan
 from terrain import KINDS, TRAINING_MAP, Terrain, rise
 
 STAIRS = Terrain(("stairs",), (3,))  # steps of 0.104 m and 0.31 m that begin at x = 0.5
-STILL = EnvConfig(start_pose=(1.0, 1.0), start_speed=0.0, forward_speed=(0.0, 0.0), push_speed=0.0, start_rows=1, climb=False)
+STILL = EnvConfig(
+    start_pose=(1.0, 1.0), start_speed=0.0, forward_speed=(0.0, 0.0), push_speed=0.0,
+    start_rows=1, climb=False,
+)  # fmt: skip
 
 
 def test_height_is_where_rays_end():
@@ -21,7 +23,9 @@ def test_height_is_where_rays_end():
     mujoco.mj_forward(model, data)
     x, y = rng.uniform(-2, 27, 4000), rng.uniform(-6, 8 * len(terrain.columns), 4000)
     geom, trunk = np.zeros(1, dtype=np.int32), model.body("trunk").id
-    down = [mujoco.mj_ray(model, data, [a, b, 9.0], [0, 0, -1.0], None, 1, trunk, geom, None) for a, b in zip(x, y)]
+    down, straight = [], [0, 0, -1.0]
+    for a, b in zip(x, y):
+        down.append(mujoco.mj_ray(model, data, [a, b, 9.0], straight, None, 1, trunk, geom, None))
     away = np.hypot(x, y) > 1  # from the robot's legs
     height = terrain.height(x, y)
     assert np.allclose(9.0 - np.array(down)[away], height[away], atol=1e-6)
@@ -53,9 +57,9 @@ class Ramp:
 def test_the_scan_turns_with_the_robot():
     ahead, turned = scan(Ramp(), np.array([[0, 0, 0.5], [0, 0, 0.5]]), np.array([0, np.pi / 2])) / 5
     assert ahead.shape == (16, 12)
-    assert np.allclose(ahead[:, 0], np.linspace(0.75, -0.75, 16))  # the ground rises from behind to the front
+    assert np.allclose(ahead[:, 0], np.linspace(0.75, -0.75, 16))  # it rises to the front
     assert np.allclose(ahead, ahead[:, :1])
-    assert np.allclose(turned[0], np.linspace(-0.55, 0.55, 12))  # and, facing left, from the left (x < 0) to the right
+    assert np.allclose(turned[0], np.linspace(-0.55, 0.55, 12))  # and, facing left, to the right
     assert np.allclose(turned, turned[:1])
 
 
@@ -66,22 +70,13 @@ def test_the_env_reads_the_ground_around_its_robots():
     assert np.allclose(x, 0) and np.all(np.abs(y) <= 1)
     heights = env.observe().heights / 5
     assert np.allclose(heights[:, :13], (z - 0.5)[:, None, None])  # up to 0.45 m ahead: flat
-    assert np.allclose(heights[:, 13:], (z - 0.5 - rise(3))[:, None, None])  # 0.55 to 0.75 m ahead: the first step
-
-
-# ---------------------------------------------------------------------- noise
-
-
-def test_noise_of_scale_zero_is_none_to_the_bit():
-    position, yaw = np.array([[2.0, 0.3, 0.7]]), np.array([0.4])
-    clean = NoisyScan(1, STAIRS, ScanNoise(), 0).read(np.arange(1), position, yaw)
-    zero = NoisyScan(1, STAIRS, ScanNoise(offset=0.0, sigma=0.0, redraw=True), 0).read(np.arange(1), position, yaw)
-    assert np.array_equal(clean, zero)
+    assert np.allclose(heights[:, 13:], (z - 0.5 - rise(3))[:, None, None])  # ahead: the first step
 
 
 def test_noise_is_read_from_words():
     assert parse("clean") == ScanNoise()
-    assert parse("offset:0.3+missing:4+sigma:0.1") == ScanNoise(offset=0.3, missing_patches=4, sigma=0.1)
+    noise = ScanNoise(offset=0.3, missing_patches=4, sigma=0.1)
+    assert parse("offset:0.3+missing:4+sigma:0.1") == noise
     for text in ("fog", "sigma", "sigma:-1", "sigma:nan", "missing:13", "missing:1.5", ""):
         with pytest.raises(ValueError, match="write clean, offset:0.3"):
             parse(text)
@@ -90,31 +85,32 @@ def test_noise_is_read_from_words():
 def test_low_frequency_noise_moves_whole_patches_by_its_scale():
     noise = ScanNoise(offset=0.3, offset_patches=5)
     shifts = patch_shifts(noise, 2000, np.random.default_rng(0))
-    patches = shifts.reshape(2000, 4, 4, 3, 4, 3).transpose(0, 1, 3, 2, 4, 5).reshape(2000, 12, 16, 3)
+    patches = shifts.reshape(2000, 4, 4, 3, 4, 3).swapaxes(2, 3).reshape(2000, 12, 16, 3)
     assert np.array_equal(patches, np.repeat(patches[:, :, :1], 16, axis=2))
     moved = np.linalg.norm(patches[:, :, 0], axis=2)
     assert np.all((moved > 0).sum(axis=1) == 5) and np.allclose(moved[moved > 0], 0.3)
-    directions = patches[:, :, 0][moved > 0] / 0.3  # 10000, uniform on the sphere: mean 0, variance 1/3 on each axis
-    assert np.allclose(directions.mean(0), 0, atol=0.03) and np.allclose(directions.var(0), 1 / 3, atol=0.02)
+    directions = patches[:, :, 0][moved > 0] / 0.3  # 10000, uniform on the sphere
+    assert np.allclose(directions.mean(0), 0, atol=0.03)
+    assert np.allclose(directions.var(0), 1 / 3, atol=0.02)
     assert np.array_equal(shifts, patch_shifts(noise, 2000, np.random.default_rng(0)))
 
 
 def test_high_frequency_noise_has_its_scale_and_no_order():
     shifts = point_shifts(ScanNoise(sigma=0.2), 100, np.random.default_rng(0))
-    assert np.allclose(shifts.mean((0, 1, 2)), 0, atol=0.01) and np.allclose(shifts.std((0, 1, 2)), 0.2, atol=0.01)
+    assert np.allclose(shifts.mean((0, 1, 2)), 0, atol=0.01)
+    assert np.allclose(shifts.std((0, 1, 2)), 0.2, atol=0.01)
     assert abs(np.corrcoef(shifts[:, 0, 0, 0], shifts[:, 0, 1, 0])[0, 1]) < 0.3
 
 
 def test_missing_points_are_rolts_patches():
     missing = missing_points(ScanNoise(missing_patches=4), 50, np.random.default_rng(0))
-    patches = missing.reshape(50, 4, 4, 3, 4).swapaxes(2, 3).reshape(50, 12, 16)  # as ROLT.tokens cuts them
+    patches = missing.reshape(50, 4, 4, 3, 4).swapaxes(2, 3).reshape(50, 12, 16)  # as in ROLT
     assert np.array_equal(as_patches(missing[7]), patches[7])
     assert np.array_equal(patches.all(2), patches.any(2)) and np.all(patches.all(2).sum(1) == 4)
 
 
 def test_a_lateral_shift_reads_the_ground_elsewhere():
-    """On a ramp a point read 0.2 m further ahead says that the ground is 0.2 m higher; a vertical
-    shift says so anywhere."""
+    """On a ramp a point read 0.2 m further ahead is 0.2 m higher; a vertical shift is anywhere."""
     position, yaw, shift = np.array([[0, 0, 0.5]]), np.array([0.0]), np.zeros((1, 16, 12, 3))
     clean = scan(Ramp(), position, yaw)
     shift[..., 0] = 0.2
@@ -125,18 +121,16 @@ def test_a_lateral_shift_reads_the_ground_elsewhere():
 
 
 def test_noise_changes_the_scan_and_nothing_else():
-    traces = []
-    for noise in (ScanNoise(), ScanNoise(offset=0.2, missing_patches=2, sigma=0.1)):
-        env = LocomotionEnv("a1", 4, seed=3, extras=("heights",), terrain=STAIRS, noise=noise, num_threads=1)
-        first, (second, *_) = env.reset(), env.step(np.zeros((4, 12)))
-        traces.append((first, second))
+    traces, noisy = [], ScanNoise(offset=0.2, missing_patches=2, sigma=0.1)
+    how = {"seed": 3, "extras": ("heights",), "terrain": STAIRS, "num_threads": 1}
+    for noise in (ScanNoise(), noisy):
+        env = LocomotionEnv("a1", 4, noise=noise, **how)
+        traces.append((env.reset(), env.step(np.zeros((4, 12)))[0]))
     (clean, clean_next), (noisy, noisy_next) = traces
-    assert np.array_equal(clean.legs, noisy.legs) and np.array_equal(clean_next.legs, noisy_next.legs)
+    assert np.array_equal(clean.legs, noisy.legs)
+    assert np.array_equal(clean_next.legs, noisy_next.legs)
     assert not np.array_equal(clean.heights, noisy.heights)
     assert all((scan == 0).sum() >= 2 * 16 for scan in noisy.heights)
-
-
-# ---------------------------------------------------------------------- robots on it
 
 
 def test_curriculum_by_hand():
@@ -149,27 +143,30 @@ def test_curriculum_by_hand():
 
 
 def test_robots_climb_when_their_episode_ends():
-    env = LocomotionEnv("a1", 2, terrain=TRAINING_MAP, config=EnvConfig(forward_speed=(0.5, 0.5), start_rows=1), num_threads=1)
+    config = EnvConfig(forward_speed=(0.5, 0.5), start_rows=1)
+    env = LocomotionEnv("a1", 2, terrain=TRAINING_MAP, config=config, num_threads=1)
     env.reset()
     assert list(env.row) == [0, 0] and list(env.column) == [0, 1]
     env.age[:] = env.episode_steps - 1
     env.world.bind("qpos")[0, 0] = 4.5
     env.step(np.zeros((2, 12)))
     assert list(env.row) == [1, 0]
-    assert env.position[0, 0] == pytest.approx(8.0) and env.position[1, 1] == pytest.approx(8.0, abs=1.0)
-    env.world.bind("qvel")[0] = np.nan  # a diverged simulation is put at (0, 0), far from where its robot began
+    assert env.position[0, 0] == pytest.approx(8.0)
+    assert env.position[1, 1] == pytest.approx(8.0, abs=1.0)
+    env.world.bind("qvel")[0] = np.nan  # diverged, it is put at (0, 0), far from where it began
     env.step(np.zeros((2, 12)))
     assert list(env.row) == [1, 0]
 
 
 def test_a_robot_stands_on_every_tile():
     rows, columns = len(TRAINING_MAP.levels), len(TRAINING_MAP.columns)
-    env = LocomotionEnv("a1", rows * columns, extras=("heights",), terrain=TRAINING_MAP, config=STILL, num_threads=2)
+    how = {"extras": ("heights",), "terrain": TRAINING_MAP, "config": STILL, "num_threads": 2}
+    env = LocomotionEnv("a1", rows * columns, **how)
     env.reset()
     env.row[:] = np.repeat(np.arange(rows), columns)
     env._reset(np.arange(env.num_envs))
-    observation = env.observe()
-    assert np.all(observation.heights[:, 4:12, 3:9] == observation.heights[:, 4:5, 3:4])  # level ground underneath
+    heights = env.observe().heights
+    assert np.all(heights[:, 4:12, 3:9] == heights[:, 4:5, 3:4])  # level ground underneath
     for _ in range(100):
         *_, terminated, _, _ = env.step(np.zeros((env.num_envs, 12)))
         assert not terminated.any()

@@ -15,8 +15,7 @@ T, N = 3, 8  # steps, robots of all processes
 
 
 def updated(world_size: int, rank: int = 0) -> dict:
-    """One update, with a single minibatch, on this rank's share of a made-up rollout that is the
-    same for all."""
+    """One update, with a single minibatch, on this rank's share of a made-up rollout."""
     torch.set_num_threads(1)
     torch.manual_seed(0)
     policy = make_policy("rolt", A1, TASKS["stiffness"], False)
@@ -34,15 +33,16 @@ def updated(world_size: int, rank: int = 0) -> dict:
 
     mine = slice(rank * N // world_size, (rank + 1) * N // world_size)
     buffer.observation = Observation(*(field[:, mine] for field in buffer.observation))
-    for name in ("action", "mean", "log_prob", "reward", "value", "next_value", "terminated", "truncated"):
+    fields = "action mean log_prob reward value next_value terminated truncated"
+    for name in fields.split():
         setattr(buffer, name, getattr(buffer, name)[:, mine])
     buffer.masks = {name: packed[:, mine] for name, packed in buffer.masks.items()}
 
     learner = Learner(policy, critic, PPOConfig(epochs=1, minibatches=1))
     stats = learner.update(buffer, torch.Generator().manual_seed(rank))
     gradient = torch.cat([p.grad.flatten() for p in learner.parameters.values()])
-    rate = learner.optimizer.param_groups[0]["lr"]
-    return {"gradient": gradient, "learning_rate": rate, "stats": stats, "weights": policy.state_dict()}
+    result = {"gradient": gradient, "learning_rate": learner.optimizer.param_groups[0]["lr"]}
+    return result | {"stats": stats, "weights": policy.state_dict()}
 
 
 def rank_of_two(rank: int, folder: str) -> None:
@@ -56,8 +56,9 @@ def test_two_ranks_of_half_the_robots_follow_one_rank_of_all(tmp_path):
     first, second = (torch.load(tmp_path / f"{rank}.pt") for rank in (0, 1))
     one = updated(1)
     assert torch.equal(first["gradient"], second["gradient"]) and first["stats"] == second["stats"]
-    assert all(torch.equal(first["weights"][name], second["weights"][name]) for name in one["weights"])
+    for name in one["weights"]:
+        assert torch.equal(first["weights"][name], second["weights"][name])
     assert one["gradient"].norm() > 0.1
     assert torch.allclose(first["gradient"], one["gradient"], atol=1e-5)
-    assert first["learning_rate"] == one["learning_rate"] != PPOConfig.learning_rate  # KL has moved it
+    assert first["learning_rate"] == one["learning_rate"] != PPOConfig.learning_rate  # moved by KL
     assert first["stats"] == pytest.approx(one["stats"], abs=1e-4)

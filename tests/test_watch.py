@@ -4,15 +4,14 @@ import subprocess
 import sys
 from pathlib import Path
 
-import mujoco
 import numpy as np
 import pytest
 import torch
 from PIL import Image
 
-import checkpoint
 import watch
 from baselines import make_policy
+from conftest import save_policy
 from faults import TASKS, healthy, lock, parse
 from noise import ScanNoise
 from robots import A1
@@ -39,10 +38,9 @@ def test_the_robot_walks_on_with_what_it_was_told(show):
     show.step()
     assert show.env is env and show.fault == lock("RL_calf")  # without a reset
     assert env.world.bind("eq_active")[0].nonzero()[0].tolist() == [11] and env.command[0, 0] == 0.3
-    assert show.noise == ScanNoise(offset=0.2, missing_patches=3) and env.scan.missing[0].sum() == 3 * 16
+    assert show.noise == ScanNoise(offset=0.2, missing_patches=3)
+    assert env.scan.missing[0].sum() == 3 * 16
     assert show.said == "lock:RL_calf, 0.3 m/s, scandots offset:0.2+missing:3"
-    red = show.model.geom_rgba[show.model.geom_bodyid == show.model.body("RL_calf").id]
-    assert len(red) and np.all(red[:, 0] > 0.8)
 
 
 def test_skates_begin_a_new_episode_and_again_does(show):
@@ -56,33 +54,33 @@ def test_skates_begin_a_new_episode_and_again_does(show):
 
 
 @pytest.mark.parametrize(
-    "word, why", [("melt:FR", "lock:FR_calf"), ("lock:MR_calf", "no joint or leg"), ("sigma:-1", "from 0 on")]
+    "word, why",
+    [("melt:FR", "lock:FR_calf"), ("lock:MR_calf", "no joint or leg"), ("sigma:-1", "from 0 on")],
 )
 def test_a_word_that_cannot_be_read_changes_nothing(show, word, why):
     env, observation = show.env, show.observation
     show.hear(word)
-    assert why in show.said and (show.env, show.observation, show.fault) == (env, observation, healthy())
+    assert why in show.said and show.fault == healthy()
+    assert show.env is env and show.observation is observation
 
 
 def test_films_are_written_without_a_display(tmp_path, monkeypatch):
     """Where no off-screen rendering works, the script must say so in one line."""
     for name in ("DISPLAY", "WAYLAND_DISPLAY", "MUJOCO_GL"):
         monkeypatch.delenv(name, raising=False)
-    card = {"robot": "a1", "task": "stiffness", "policy": "rolt", "scan": False, "seed": 0, "steps": 0, "stages": {}}
-    weights = make_policy("rolt", A1, TASKS["stiffness"], False).state_dict()
-    checkpoint.save(card | {"init": None, "weights": weights}, tmp_path / "policy.pt")
-    words = [sys.executable, ROOT / "watch.py", "--checkpoint", "policy.pt", "--seconds", "0.4", "--out"]
-    one = subprocess.run([*words, "one.gif", "--fault", "lock:FL_calf"], cwd=tmp_path, capture_output=True, text=True)
+    words = [sys.executable, ROOT / "watch.py", "--fault", "lock:FL_calf", "--seconds", "0.4"]
+    words += ["--checkpoint", save_policy(tmp_path / "policy.pt"), "--out", "one.gif"]
+    one = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True)
     if one.returncode:
         assert "MUJOCO_GL" in one.stderr and one.stderr.count("\n") == 1
         pytest.skip(f"nothing can be drawn here: {one.stderr}")
     film = Image.open(tmp_path / "one.gif")
     assert (film.n_frames, film.size) == (10, (480, 300))  # every second step of 20
-    assert len(np.unique(np.asarray(film.convert("RGB")).reshape(-1, 3), axis=0)) > 10  # something is to be seen
+    colours = np.unique(np.asarray(film.convert("RGB")).reshape(-1, 3), axis=0)
+    assert len(colours) > 10  # something is to be seen
 
 
 def test_nothing_but_the_faulty_leg_is_painted(show):
     plain, painted = show.env.model, watch.painted(show.env, lock("FR_calf"))
     changed = (plain.geom_rgba != painted.geom_rgba).any(axis=1)
-    bodies = {mujoco.mj_id2name(plain, mujoco.mjtObj.mjOBJ_BODY, body) for body in plain.geom_bodyid[changed]}
-    assert bodies == {"FR_calf"}
+    assert {plain.body(body).name for body in plain.geom_bodyid[changed]} == {"FR_calf"}
