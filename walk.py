@@ -11,15 +11,12 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from env import CONTROL_DT, EnvConfig, LocomotionEnv, Observation
+from env import CONTROL_DT, EnvConfig, LocomotionEnv
 from faults import Fault
+from ppo import to_tensors
 
 WARM_UP = 2.0  # s after the start that do not count for a gait; ours: by then the robot walks
 SHORTEST = 1.0  # s on its feet after that, or there is no gait to measure; ours: several strides
-
-
-def to_tensors(observation: Observation) -> Observation:
-    return observation._make(torch.from_numpy(field) for field in observation)
 
 
 def straight_ahead(policy, speed: float, seconds: float) -> EnvConfig:
@@ -63,7 +60,7 @@ def take_a_walk(policy, robot, faults, speed, seconds, seed=0, threads=0, **env_
     for _ in range(round(seconds / CONTROL_DT)):
         poses.append(env.world.bind("qpos").copy())
         contacts.append(env.world.bind("sensordata")[:, feet] > 0)
-        action = policy(to_tensors(observation)).numpy()
+        action = policy(to_tensors(observation, "cpu")).numpy()
         observation, reward, terminated, _, info = env.step(action)
         divergences += (upright & info["diverged"]).sum()
         valid = upright & ~info["diverged"]  # a diverged position means nothing: keep the last one

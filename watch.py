@@ -31,9 +31,10 @@ from checkpoint import load_policy
 from env import CONTROL_DT, LocomotionEnv
 from faults import REAL_WORLD, TASKS, Fault, first_task, joint_mask, parse, props, write_fault
 from noise import parse as parse_noise
+from ppo import to_tensors
 from robots import ROBOTS
 from terrain import Terrain
-from walk import Walk, straight_ahead, take_a_walk, to_tensors
+from walk import Walk, straight_ahead, take_a_walk
 
 HELP = "type a fault (lock:RL_calf, healthy), a speed (0.5), noise (sigma:0.1), again or quit"
 DISPLAY = os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
@@ -172,7 +173,7 @@ class Show:
         while not self.words.empty():
             self.hear(self.words.get().strip())
         self.env.command[:, 0] = self.speed
-        action = self.policy(to_tensors(self.observation)).numpy()
+        action = self.policy(to_tensors(self.observation, "cpu")).numpy()
         self.observation, _, fallen, _, _ = self.env.step(action)
         if fallen[0]:
             print("it fell and starts over", flush=True)
