@@ -1,13 +1,4 @@
-"""The methods that ROLT is compared with (paper, section IV), and the list of them all.
-
-    MLP           all that ROLT sees, flat, into [512, 256, 128]
-    Mirrored MLP  (ours) the MLP, averaged with its answer to the mirrored state
-    Roll-Drop     the MLP; neurons are dropped in the rollout only (Campanaro et al. 2023)
-    RMA           a base policy that is told what is wrong with the robot, then an adaptation module
-                  that guesses it from the past second (Kumar et al. 2021)
-    ROAM          a behaviour a situation, chosen each step by value functions (Chen et al. 2024)
-
-Module PE, No PE Drop, No Feature Drop, and ours, No Leg Frames and No Identity: switches of ROLT.
+"""The methods that ROLT is compared with (paper, section IV); the list of them all is at the end.
 
 A policy is a module with forward(observation, masks) -> (B, A) mean action, std() -> (A,),
 sample_masks(n, generator) -> {name: (n, ...) bool}, and a few words on itself (`extras` and what
@@ -21,14 +12,14 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor, nn
 
-from faults import Fault, Task
-from noise import HEIGHT_SCALE, SCAN_SHAPE
+from faults import Task, other_harms
+from noise import HEIGHT_SCALE
 from ppo import Learner, PPOConfig, network, proprioception
 from robots import Robot
-from rolt import HISTORY, LOG_STD_BOUNDS, ROLT, Decoder, Masks, Observation, ROLTConfig, drop
+from rolt import HISTORY, LOG_STD_BOUNDS, ROLT, SCAN_SHAPE, Decoder, Masks, Observation
+from rolt import ROLTConfig, drop
 
 HIDDEN = (512, 256, 128)  # legged_gym
-HEIGHT_NOISE = 0.06  # m, the deviation of legged_gym's uniform +-0.1 m; the paper names none
 ROLL_DROP_RATE = 1e-4  # paper
 LATENT = 8  # size of RMA's z, Kumar et al.
 LAST_STAGE = 0.2  # steps of a stage that guesses z or chooses a policy, ours (NOTES 14)
@@ -40,11 +31,11 @@ class Stage:
 
     name: str
     share: float  # env steps, relative to the run's --steps
-    faults: tuple[tuple[float, Fault], ...]  # the robots' situations
+    faults: tuple[tuple[float, str], ...]  # the robots' situations
     actor: nn.Module
-    trained: tuple[nn.Module | nn.Parameter, ...]  # all other weights of the policy are frozen
+    trained: list[nn.Module | nn.Parameter]  # all other weights of the policy are frozen
     critic: nn.Module | None = None  # None = ppo.Critic, fresh
-    extras: tuple[str, ...] = ()  # that the observation has to hold
+    extras: tuple[str, ...] = ()  # that the observation has to hold, beside `privileged`
     learner: type[Learner] = Learner
 
 
@@ -53,12 +44,11 @@ class Policy(nn.Module):
 
     replays_masks = True
     leg_frames = True
-    height_noise = 0.0  # m, added to the scan in training
+    height_noise = 0.06  # m, in training; the deviation of legged_gym's uniform +-0.1 m
 
     def __init__(self, robot: Robot, scan: bool):
         super().__init__()
-        self.num_legs, self.num_joints = len(robot.legs), len(robot.links)
-        self.num_actions = self.num_legs * self.num_joints
+        self.num_actions = len(robot.joints)
         self.frame = 3 * self.num_actions + 12  # numbers that the whole robot sees in one step
         self.extras = ("heights",) if scan else ()
         self.num_heights = SCAN_SHAPE[0] * SCAN_SHAPE[1] if scan else 0
@@ -74,15 +64,9 @@ class Policy(nn.Module):
         noise = torch.randn(n, *SCAN_SHAPE, generator=generator, device=generator.device)
         return {"height_noise": HEIGHT_SCALE * self.height_noise * noise}
 
-    def heights_of(self, observation: Observation, masks: Masks | None) -> Tensor:
-        """(B, 16, 12) or (B, 0)"""
-        return observation.heights + (masks or {}).get("height_noise", 0.0)
-
 
 class MLP(Policy):
-    """One network for everything."""
-
-    height_noise = HEIGHT_NOISE
+    """All that ROLT sees, flat, into [512, 256, 128]."""
 
     def __init__(self, robot: Robot, task: Task, scan: bool):
         super().__init__(robot, scan)
@@ -91,20 +75,17 @@ class MLP(Policy):
         self.decoder = Decoder(sizes[-1], self.num_actions)
 
     def forward(self, observation: Observation, masks: Masks | None = None) -> Tensor:
-        heights = self.heights_of(observation, masks).flatten(1)
-        x = torch.cat([proprioception(observation.legs), heights], dim=1)
+        masks = masks or {}
+        heights = observation.heights + masks.get("height_noise", 0.0)
+        x = torch.cat([proprioception(observation.legs), heights.flatten(1)], dim=1)
         for i, layer in enumerate(self.hidden):
-            x = drop(nn.functional.elu(layer(x)), (masks or {}).get(f"hidden_{i}"), ROLL_DROP_RATE)
+            x = drop(nn.functional.elu(layer(x)), masks.get(f"hidden_{i}"), ROLL_DROP_RATE)
         return self.decoder(x)
 
 
 class MirroredMLP(MLP):
-    """Our control: an MLP averaged with its answer to the mirrored state, mirrored back. It has
-    symmetry, but no legs that share.
-
-    In leg frames (NOTES 1) a state's mirror image is the same numbers with left and right legs
-    exchanged, and the scan's columns reversed: to limp on FL is to limp on FR, mirrored.
-    """
+    """Our control: symmetry, but no legs that share. In leg frames (NOTES 1) a state's mirror image
+    is the same numbers, left and right legs exchanged and the scan's columns reversed."""
 
     def __init__(self, robot: Robot, task: Task, scan: bool):
         super().__init__(robot, task, scan)
@@ -112,25 +93,20 @@ class MirroredMLP(MLP):
         self.swap = [robot.mounts.index(mount) for mount in mirrored]  # the leg on the other side
 
     def forward(self, observation: Observation, masks: Masks | None = None) -> Tensor:
-        noise = (masks or {}).get("height_noise")
-        image_masks = None if noise is None else {"height_noise": noise.flip(2)}
-        legs, heights = observation.legs[:, self.swap], observation.heights
-        heights = heights.flip(2) if heights.numel() else heights
-        image = observation._replace(legs=legs, heights=heights)
-        back = super().forward(image, image_masks).unflatten(1, (self.num_legs, -1))
+        image = observation._replace(legs=observation.legs[:, self.swap])
+        if self.num_heights:
+            image = image._replace(heights=observation.heights.flip(2))
+        image_masks = {name: noise.flip(2) for name, noise in (masks or {}).items()}
+        back = super().forward(image, image_masks).unflatten(1, (len(self.swap), -1))
         return (super().forward(observation, masks) + back[:, self.swap].flatten(1)) / 2
 
 
 class RollDrop(MLP):
-    """The MLP whose hidden neurons are dropped, at a tiny rate, while it acts.
+    """The MLP, its neurons dropped while it acts (Campanaro et al. 2023). The update knows nothing
+    of it: where one was, PPO's ratio is not 1, even before a weight has moved: a random number that
+    PPO takes for progress or clips. Hence the tiny rate: of 896 neurons none is dropped with
+    probability (1 - p)^896, 91 % at 1e-4, 0.01 % at 1e-2 (`python evaluate.py dropout_ratio`)."""
 
-    The update knows nothing of it, so where a neuron was dropped PPO's ratio is not 1, even before
-    a weight has moved: a random number that PPO takes for progress or clips. Of 896 neurons at rate
-    p none is dropped with probability (1 - p)^896: 91 % at the paper's 1e-4, hence the tiny rate;
-    0.01 % at 1e-2 (`python evaluate.py dropout_ratio`).
-    """
-
-    height_noise = 0.0
     replays_masks = False
 
     def sample_masks(self, n: int, generator: torch.Generator) -> Masks:
@@ -142,13 +118,9 @@ class RollDrop(MLP):
 
 
 class RMA(Policy):
-    """Rapid motor adaptation. Stage 1, PPO: base(proprioception, heights, z = encoder(privileged)).
-    Stage 2, supervised: adaptation(past 50 steps) learns to say z while it drives the frozen base.
-
-    Where the observation has `past`, z is guessed; at test there is no `privileged`.
-    """
-
-    height_noise = HEIGHT_NOISE
+    """Rapid motor adaptation (Kumar et al. 2021). Stage 1, PPO: base(proprioception, heights, z =
+    encoder(privileged)). Stage 2, supervised: adaptation(past 50 steps) learns to say z while it
+    drives the frozen base. Where the observation has `past`, as at test, z is guessed."""
 
     def __init__(self, robot: Robot, task: Task, scan: bool):
         super().__init__(robot, scan)
@@ -160,7 +132,8 @@ class RMA(Policy):
                 nn.Conv2d(8, 16, 3, stride=2, padding=1), nn.ELU(), nn.Flatten(),
                 nn.Linear(self.num_heights, features), nn.ELU(),
             )  # fmt: skip
-        self.encoder = network(2 * self.num_actions + 1, 256, 128, LATENT)  # 256, 128: Kumar et al.
+        privileged = 2 * self.num_actions + 1 + other_harms(task.seen).shape[1]
+        self.encoder = network(privileged, 256, 128, LATENT)  # 256, 128: Kumar et al.
         hidden = network(HISTORY * self.frame + features + LATENT, *HIDDEN)
         self.base = nn.Sequential(hidden, nn.ELU(), Decoder(HIDDEN[-1], self.num_actions))
         self.adaptation = Adaptation(self.frame)
@@ -170,16 +143,17 @@ class RMA(Policy):
         z = self.adaptation(observation.past) if guessed else self.encoder(observation.privileged)
         parts = [proprioception(observation.legs), z]
         if self.num_heights:
-            parts.append(self.heights(self.heights_of(observation, masks)))
+            noise = (masks or {}).get("height_noise", 0.0)
+            parts.append(self.heights(observation.heights + noise))
         return self.base(torch.cat(parts, dim=1))
 
     def stages(self, task: Task) -> list[Stage]:
-        scan = ("heights",) if self.num_heights else ()
-        base = (self.encoder, self.base, self.log_std, *([self.heights] if scan else []))
-        told, guess = (*scan, "privileged"), (self.adaptation,)
-        first = Stage("base", 1.0, task.training, self, base, None, told)
-        last = (task.training, self, guess, NoCritic(), (*told, "past"), AdaptationLearner)
-        return [first, Stage("adaptation", LAST_STAGE, *last)]
+        base = [self.log_std] + [x for x in self.children() if x is not self.adaptation]
+        return [
+            Stage("base", 1.0, task.training, self, base, extras=self.extras[:-1]),  # no past
+            Stage("adaptation", LAST_STAGE, task.training, self, [self.adaptation],
+                  extras=self.extras, learner=AdaptationLearner),
+        ]  # fmt: skip
 
 
 class Adaptation(nn.Module):
@@ -199,50 +173,40 @@ class Adaptation(nn.Module):
         return self.time(self.step(steps).transpose(1, 2))
 
 
-class NoCritic(nn.Module):
-    """Where nobody asks for values."""
-
-    def forward(self, observation: Observation) -> Tensor:
-        return torch.zeros(len(observation.legs), device=observation.legs.device)
-
-
 class AdaptationLearner(Learner):
     """Stage 2: mean squared error between the guessed z and the encoder's."""
 
-    def __init__(self, policy: RMA, critic: NoCritic, config: PPOConfig, bf16: bool = False):
-        config = replace(config, learning_rate=1e-3)  # ours: supervised learning bears more
-        super().__init__(policy, critic, config, bf16)
+    first_rate = 1e-3  # ours: supervised learning bears more
 
     def loss(self, batch: dict, old_std: Tensor, progress: float) -> tuple[Tensor, dict]:
         observation = batch["observation"]
-        with torch.no_grad():
-            truth = self.policy.encoder(observation.privileged)
+        truth = self.policy.encoder(observation.privileged)  # frozen
         error = (self.policy.adaptation(observation.past) - truth).square().mean()
         return error, {"other_loss": error}
 
 
 class ROAM(Policy):
-    """Robust autonomous modulation: each step by a behaviour i ~ softmax(V_1(s), ..., V_K(s)).
+    """Robust autonomous modulation (Chen et al. 2024): an MLP a situation, and each step a draw
+    among them, i ~ softmax(V_1(s), ..., V_K(s)). In the last stage each acts in its own situation
+    (the observation names it) and the values learn who belongs where."""
 
-    Every behaviour is an MLP that was trained in one situation. In the last stage each acts in its
-    own situation (the observation names it) and the values learn who belongs where.
-    """
+    height_noise = 0.0  # of the last stage
 
     def __init__(self, robot: Robot, task: Task, scan: bool):
         super().__init__(robot, scan)
         self.behaviours = nn.ModuleList(MLP(robot, task, scan) for _ in task.training)
-        inputs = HISTORY * self.frame + self.num_heights
-        self.critics = nn.ModuleList(BehaviourValue(inputs) for _ in task.training)
+        sizes = (HISTORY * self.frame + self.num_heights, *HIDDEN, 1)
+        self.critics = nn.ModuleList(network(*sizes) for _ in task.training)
         self.generator = torch.Generator().manual_seed(0)  # of the choice at test
-        self.picked = torch.zeros(0, len(task.training))  # (B, K) how often each was chosen at test
         del self.log_std  # each behaviour has its own
 
     def std(self) -> Tensor:
         return torch.stack([behaviour.std() for behaviour in self.behaviours]).mean(0)
 
     def values(self, observation: Observation) -> Tensor:
-        """(B, K)"""
-        return torch.stack([critic(observation) for critic in self.critics], dim=1)
+        """(B, K), of what the behaviours see: at test nobody knows more."""
+        parts = [proprioception(observation.legs), observation.heights.flatten(1)]
+        return torch.cat([critic(torch.cat(parts, dim=1)) for critic in self.critics], dim=1)
 
     def forward(self, observation: Observation, masks: Masks | None = None) -> Tensor:
         if observation.situation.numel():
@@ -250,9 +214,6 @@ class ROAM(Policy):
         else:
             odds = self.values(observation).softmax(dim=1).cpu()
             choice = torch.multinomial(odds, 1, generator=self.generator)
-            if len(self.picked) != len(choice):
-                self.picked = torch.zeros(odds.shape)
-            self.picked += nn.functional.one_hot(choice.squeeze(1), odds.shape[1])
         actions = torch.stack([act(observation) for act in self.behaviours], dim=1)  # (B, K, A)
         index = choice.to(actions.device)[:, :, None].expand(-1, -1, actions.shape[2])
         return actions.gather(1, index).squeeze(1)
@@ -260,24 +221,13 @@ class ROAM(Policy):
     def stages(self, task: Task) -> list[Stage]:
         """All steps for each of the behaviours, and some for the values."""
         stages = []
-        for actor, (_, fault) in zip(self.behaviours, task.training, strict=True):
-            situation = ((1.0, fault),)
-            stages.append(Stage(str(fault), 1.0, situation, actor, (actor,), None, self.extras))
-        extras, values = (*self.extras, "situation"), (self.critics,)
-        last = (task.training, self, values, OwnValue(self), extras, ROAMLearner)
-        return [*stages, Stage("values", LAST_STAGE, *last)]
-
-
-class BehaviourValue(nn.Module):
-    """V_i(s), on what the behaviour sees: at test nobody knows more."""
-
-    def __init__(self, inputs: int):
-        super().__init__()
-        self.network = network(inputs, *HIDDEN, 1)
-
-    def forward(self, observation: Observation) -> Tensor:
-        parts = [proprioception(observation.legs), observation.heights.flatten(1)]
-        return self.network(torch.cat(parts, dim=1)).squeeze(1)
+        for actor, fault in zip(self.behaviours, task.seen):
+            stages.append(Stage(fault, 1.0, ((1.0, fault),), actor, [actor], extras=self.extras))
+        values = Stage(
+            "values", LAST_STAGE, task.training, self, [self.critics], critic=OwnValue(self),
+            extras=(*self.extras, "situation"), learner=ROAMLearner,
+        )  # fmt: skip
+        return [*stages, values]
 
 
 class OwnValue(nn.Module):
@@ -285,49 +235,39 @@ class OwnValue(nn.Module):
 
     def __init__(self, policy: ROAM):
         super().__init__()
-        self.policy = [policy]  # in a list: its weights are not this module's
+        self.values = policy.values  # a function: its weights are not this module's
 
     def forward(self, observation: Observation) -> Tensor:
-        return self.policy[0].values(observation).gather(1, observation.situation.long()).squeeze(1)
-
-
-def roam_loss(values: Tensor, situation: Tensor, target: Tensor, weight: float = 1.0):
-    """Bellman loss of the situation's own value, and `weight` times the cross-entropy over all: a
-    state's values are logits that have to name the behaviour that visits it.
-
-    values (B, K), situation (B,) long, target (B,) return -> two means over the batch. weight: 1
-    for stiffness tests (Chen et al.).
-    """
-    own = values.gather(1, situation[:, None]).squeeze(1)
-    return (own - target).square().mean(), weight * nn.functional.cross_entropy(values, situation)
+        return self.values(observation).gather(1, observation.situation.long()).squeeze(1)
 
 
 class ROAMLearner(Learner):
-    """The last stage: nothing but the values learns."""
+    """The last stage: Bellman loss of the situation's own value, and the cross-entropy over all: a
+    state's values are logits that have to name the behaviour that visits it (Chen et al.)."""
 
-    def __init__(self, policy: ROAM, critic: OwnValue, config: PPOConfig, bf16: bool = False):
-        config = replace(config, learning_rate=config.critic_learning_rate)
-        super().__init__(policy, critic, config, bf16)
+    first_rate = PPOConfig.critic_learning_rate
 
     def loss(self, batch: dict, old_std: Tensor, progress: float) -> tuple[Tensor, dict]:
-        values = self.policy.values(batch["observation"])
-        situation = batch["observation"].situation.squeeze(1).long()
-        bellman, entropy = roam_loss(values, situation, batch["returns"])
+        values = self.policy.values(batch["observation"])  # (B, K)
+        situation = batch["observation"].situation.long()  # (B, 1)
+        own = values.gather(1, situation).squeeze(1)
+        bellman = (own - batch["returns"]).square().mean()
+        entropy = nn.functional.cross_entropy(values, situation.squeeze(1))  # weight 1: Chen et al.
         return bellman + entropy, {"value_loss": bellman, "other_loss": entropy}
 
 
-# `train.py --policy`, in the order of the results: a class, or a configuration of ROLT.
+# `train.py --policy`, in the order of the results: a class, or a switch of ROLT.
 METHODS = {
     "mlp": MLP,
-    "mirrored-mlp": MirroredMLP,
+    "mirrored-mlp": MirroredMLP,  # ours
     "roll-drop": RollDrop,
     "rma": RMA,
     "roam": ROAM,
     "module-pe": ROLTConfig(identity="embedding"),
     "no-pe-drop": ROLTConfig(pe_dropout=0.0),
     "no-feature-drop": ROLTConfig(feature_dropout=0.0),
-    "no-leg-frames": ROLTConfig(leg_frames=False),
-    "no-identity": ROLTConfig(identity="none"),
+    "no-leg-frames": ROLTConfig(leg_frames=False),  # ours
+    "no-identity": ROLTConfig(identity="none"),  # ours
     "rolt": ROLTConfig(),
 }
 
@@ -344,4 +284,4 @@ def training_stages(policy: nn.Module, task: Task) -> list[Stage]:
     """How the policy is trained, one stage after the other."""
     if hasattr(policy, "stages"):
         return policy.stages(task)
-    return [Stage("ppo", 1.0, task.training, policy, (policy,), extras=policy.extras)]
+    return [Stage("ppo", 1.0, task.training, policy, [policy], extras=policy.extras)]

@@ -4,30 +4,27 @@
     python benchmark.py walk                   # trains until the speed is 80 % of the command
 
 The limit is what cannot be left away: MuJoCo's bare `Batch.step`, and the policy's and critic's
-matrix products at the rate of one large product (in bf16 where training uses it). What is left are
-masks, norms, attention's small products, copies, the optimiser. Times are of one thread, as in
-training; on a shared machine only ratios are steady.
+matrix products at the rate of one large product (in bf16 where training uses it). Times are of one
+thread, as in training; on a shared machine only ratios are steady.
 """
 
 import argparse
-import csv
-import statistics
 import subprocess
 import sys
 import tempfile
 import time
+import timeit
 from pathlib import Path
 
+import numpy as np
 import torch
 from torch.utils.flop_counter import FlopCounterMode
 
+import train
 from baselines import METHODS, make_policy, training_stages
-from env import EnvConfig, LocomotionEnv
-from faults import TASKS, first_task
-from ppo import Critic, Learner, PPOConfig, RolloutBuffer, collect
+from faults import TASKS
+from ppo import collect
 from robots import ROBOTS
-
-BF16 = torch.cpu._is_avx512_bf16_supported() or torch.cpu._is_amx_tile_supported()
 
 
 def timed(function, times: list[float]):
@@ -42,71 +39,53 @@ def timed(function, times: list[float]):
     return call
 
 
-def product_rate(bf16: bool) -> float:
-    """Floating-point operations a second of a large product, on one thread."""
-    dtype, times = torch.bfloat16 if bf16 else torch.float32, []
-    a, b = torch.randn(1024, 512).to(dtype), torch.randn(512, 512).to(dtype)
-    for _ in range(50):
-        timed(torch.matmul, times)(a, b)
-    return 2 * 1024 * 512 * 512 / statistics.median(times)
-
-
-def iterations(robot: str, name: str, scan: bool, rounds: int = 4, num_envs: int = 256) -> None:
+def iterations(words: list[str]) -> None:
     """Prints the time of a whole training iteration, by part, and which share the limit has."""
-    task, generator = TASKS[first_task(robot)], torch.Generator().manual_seed(0)
-    torch.manual_seed(0)
-    policy = make_policy(name, ROBOTS[robot], task, scan)
-    stage = training_stages(policy, task)[0]
-    config, extras = EnvConfig(leg_frames=policy.leg_frames), {*stage.extras, "privileged"}
-    env = LocomotionEnv(robot, num_envs, 0, 1, stage.faults, config, tuple(extras))
-    observation = env.reset(random_ages=True)
-    critic, T = Critic(observation), PPOConfig.steps
-    learner = Learner(stage.actor, critic, PPOConfig(minibatches=num_envs * T // 1024), BF16)
-    masks = policy.sample_masks(num_envs, generator)
-    buffer = RolloutBuffer(T, observation, env.num_actions, masks, "cpu")
-    parts = (env, stage.actor, critic, buffer)
+    small = ["--envs", "256", "--minibatches", "6", "--threads", "1", "--device", "cpu"]
+    args = train.parse_arguments([*words, *small, "--out", tempfile.gettempdir() + "/none"])
+    policy = make_policy(args.policy, ROBOTS[args.robot], TASKS[args.task], args.scan)
+    stage, bf16 = training_stages(policy, TASKS[args.task])[0], args.precision == "bf16"
+    run, generator = train.StageRun(0, stage, args, 0, policy, "cpu"), torch.Generator()
+    parts = (run.env, run.actor, run.critic, run.buffer)
 
     with FlopCounterMode(display=False) as counter:
-        observation, _ = collect(*parts, observation, generator, BF16)
-        learner.update(buffer, generator)
-    operations = counter.get_total_flops() / len(buffer)  # a sample
+        observation, _ = collect(*parts, run.observation, generator, bf16)
+        run.learner.update(run.buffer, generator)
+    operations = counter.get_total_flops() / len(run.buffer)  # a sample
 
     bare, step, acting, update = [], [], [], []
-    env.world.step, env.step = timed(env.world.step, bare), timed(env.step, step)
-    for _ in range(rounds):
-        observation, _ = timed(collect, acting)(*parts, observation, generator, BF16)
-        timed(learner.update, update)(buffer, generator)
-    del env.world.step, env.step  # or the world and its threads would never go: a cycle
+    world = run.env.world
+    world.step, run.env.step = timed(world.step, bare), timed(run.env.step, step)
+    for _ in range(4):
+        observation, _ = timed(collect, acting)(*parts, observation, generator, bf16)
+        timed(run.learner.update, update)(run.buffer, generator)
+    del world.step, run.env.step  # or the world and its threads would never go: a cycle
 
-    samples = rounds * len(buffer)  # from here on in us a sample
+    a, b = torch.randn(2, 512, 512, dtype=torch.bfloat16 if bf16 else torch.float32)
+    product = np.median(timeit.repeat(lambda: a @ b, number=1, repeat=100))  # s
+
+    samples = len(acting) * len(run.buffer)  # from here on in us a sample
     bare, step, acting, update = (1e6 * sum(x) / samples for x in (bare, step, acting, update))
-    whole, limit = acting + update, bare + 1e6 * operations / product_rate(BF16)
+    whole, limit = acting + update, bare + 1e6 * operations * product / (2 * 512**3)
     rate = f"{1e6 / whole:,.0f} env steps/s, {limit / whole:.0%} of the limit"
-    words = f"physics {bare:.0f}, rest of env.step {step - bare:.0f}, acting {acting - step:.0f}"
-    print(f"{robot} {name}{' with scan' * scan}: {rate} ({words}, update {update:.0f} us)")
+    parts = f"physics {bare:.0f}, rest of env.step {step - bare:.0f}, acting {acting - step:.0f}"
+    print(f"{' '.join(words)}: {rate} ({parts}, update {update:.0f} us)")
 
 
-def time_to_walk(robot: str, name: str, most_steps: int = 5_000_000) -> None:
-    """Trains on all cores until the speed has been 80 % of the command over ten iterations."""
+def time_to_walk(words: list[str]) -> None:
+    """Trains on all cores; prints when the speed was 80 % of the command over ten iterations."""
     with tempfile.TemporaryDirectory() as folder:
-        program, file = Path(__file__).parent / "train.py", Path(folder) / "progress.csv"
-        words = ["--robot", robot, "--policy", name, "--out", folder, "--save-minutes", "1000"]
-        start, rows, says = time.monotonic(), [], f"does not walk in {most_steps / 1e6:.0f}M steps"
-        training = subprocess.Popen([sys.executable, program, *words], stdout=subprocess.DEVNULL)
-        while training.poll() is None and (not rows or int(rows[-1]["steps"]) < most_steps):
-            time.sleep(2)
-            if file.exists():  # its last row may be half written
-                table = csv.DictReader(file.read_text().splitlines())
-                rows = [row for row in table if row["divergences"] is not None]
-            speed = sum(float(row["speed"]) for row in rows[-10:])
-            command = sum(float(row["commanded_speed"]) for row in rows[-10:])
-            if len(rows) >= 10 and speed >= 0.8 * command:
-                minutes, steps = (time.monotonic() - start) / 60, int(rows[-1]["steps"]) / 1e6
-                says = f"walks after {minutes:.1f} minutes, {steps:.2f}M env steps"
-                break
-        print(f"{robot} {name}: {says}", flush=True)
-        training.terminate()
-        training.wait()
+        program = [sys.executable, Path(__file__).parent / "train.py", "--steps", "2e6"]
+        subprocess.run([*program, *words, "--out", folder], stdout=subprocess.DEVNULL, check=True)
+        rows = np.genfromtxt(f"{folder}/progress.csv", delimiter=",", names=True)
+    minutes = np.cumsum(rows["collect_seconds"] + rows["update_seconds"]) / 60
+    excess = np.convolve(rows["speed"] - 0.8 * rows["commanded_speed"], np.ones(10), "valid")
+    walks = np.flatnonzero(excess >= 0) + 9  # excess[0] is of iterations 0 to 9
+    says = "does not walk in 2M steps"
+    if len(walks):
+        i = walks[0]
+        says = f"walks after {minutes[i]:.1f} minutes, {rows['steps'][i] / 1e6:.2f}M env steps"
+    print(f"{' '.join(words)}: {says}", flush=True)
 
 
 def main(argv: list[str] | None = None) -> None:
@@ -120,7 +99,8 @@ def main(argv: list[str] | None = None) -> None:
     torch.set_num_threads(1)
     for robot in args.robots:
         for name in args.policies:
-            time_to_walk(robot, name) if args.what == "walk" else iterations(robot, name, args.scan)
+            words = ["--robot", robot, "--policy", name, *["--scan"] * args.scan]
+            time_to_walk(words) if args.what == "walk" else iterations(words)
 
 
 if __name__ == "__main__":

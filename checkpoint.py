@@ -1,14 +1,12 @@
 """Policies and runs as files: saved whole or not at all, and read without running what is inside.
 
 Two kinds, both of torch.save, both dictionaries of plain values and tensors:
-    policy.pt      the policy's weights and what they are for (`CARD`), about 1 MB, for evaluate.py
-    checkpoint.pt  the same and all else that training needs to go on: `train.py --resume`
-
-    python checkpoint.py runs/a1-stiffness-rolt-seed0/policy.pt rolt.pt     # half as large, to ship
+    policy.pt      `CARD` and the weights, matrices in half precision: 1 MB, to show and give away
+    checkpoint.pt  the same in full, and all else that `train.py --resume` needs to go on
 """
 
 import os
-import sys
+from contextlib import contextmanager
 from pathlib import Path
 
 import torch
@@ -18,11 +16,11 @@ from faults import TASKS
 from robots import ROBOTS
 
 FORMAT = 2  # 1 was before leg frames
-CARD = ("robot", "task", "policy", "scan", "seed", "steps", "stages", "init")  # of a policy
+CARD = ("robot", "task", "policy", "scan", "seed", "steps", "stages", "init")  # what it is for
 
 
 class CheckpointError(ValueError):
-    """The file cannot be used; the message says why and what would help."""
+    """What is read here is missing, damaged or of something else; says what would help."""
 
 
 def save(content: dict, path: Path) -> None:
@@ -39,8 +37,14 @@ def save(content: dict, path: Path) -> None:
         raise OSError(f"cannot write {path} ({error}); the file there is untouched") from error
 
 
+def save_policy(content: dict, path: Path) -> None:
+    """The part of a checkpoint.pt that a policy.pt is."""
+    halves = {name: x.half() if x.dim() > 1 else x for name, x in content["weights"].items()}
+    save({key: content[key] for key in CARD} | {"weights": halves}, path)
+
+
 def load(path: str | Path) -> dict:
-    """The dictionary in the file. CheckpointError if it is missing, damaged, of another format."""
+    """The dictionary in the file."""
     if not os.path.isfile(path):
         raise CheckpointError(f"there is no checkpoint {path}")
     try:
@@ -52,31 +56,33 @@ def load(path: str | Path) -> dict:
     return content
 
 
-def load_policy(path: str | Path, robot: str | None = None) -> tuple[torch.nn.Module, dict]:
-    """The policy in a policy.pt or checkpoint.pt, ready to act, and its card (`CARD`). robot: if
-    given, the one it must be for. CheckpointError if the file cannot be used."""
+@contextmanager
+def loaded(path: str | Path):
+    """`load`; if other things are in it than are asked for, that ends in a CheckpointError, too."""
     content = load(path)
     try:
+        yield content
+    except (KeyError, TypeError, AttributeError, IndexError, RuntimeError) as error:
+        why = " ".join(str(error).split())[:200]
+        raise CheckpointError(f"{path} does not fit ({why}): train it again") from error
+
+
+def load_policy(path: str | Path, robot: str | None = None) -> tuple[torch.nn.Module, dict]:
+    """The policy in the file (of this robot, if one is given), ready to act, and its card."""
+    with loaded(path) as content:
         card = {key: content[key] for key in CARD}
         name, task, scan = card["policy"], TASKS[card["task"]], card["scan"]
         policy = make_policy(name, ROBOTS[card["robot"]], task, scan)
         policy.load_state_dict(content["weights"])  # as float32, whatever the file has
-    except (KeyError, TypeError, AttributeError, RuntimeError) as error:
-        why = " ".join(str(error).split())[:200]
-        raise CheckpointError(f"{path} does not fit this program ({why}): train again") from error
-    if robot is not None and card["robot"] != robot:
+    if robot not in (None, card["robot"]):
         raise CheckpointError(f"{path} was trained on the {card['robot']}, not on the {robot}")
-    if bad := [name for name, x in policy.state_dict().items() if not torch.isfinite(x).all()]:
-        raise CheckpointError(f"{path} is of no use: {bad[0]} is not finite")
     return policy.eval(), card
 
 
 def start_from(path: str | Path, policy: torch.nn.Module, critic: torch.nn.Module) -> None:
-    """Puts the file's weights into a fresh policy and, those of a checkpoint.pt, a fresh critic. If
-    they are of a policy without the scan: inputs that it did not have come last, and their weights
-    start at 0, so that nothing changes at first. CheckpointError if the file cannot be used."""
-    content = load(path)
-    try:
+    """Puts the file's weights into a fresh policy and, of a checkpoint.pt, into a fresh critic. New
+    inputs (the scan) come last, and their weights start at 0: nothing changes at first."""
+    with loaded(path) as content:
         for module, saved in ((policy, content["weights"]), (critic, content.get("critic", {}))):
             own = module.state_dict()
             for name, x in saved.items():
@@ -84,17 +90,3 @@ def start_from(path: str | Path, policy: torch.nn.Module, critic: torch.nn.Modul
                     x = torch.cat([x, torch.zeros(len(x), own[name].shape[1] - x.shape[1])], dim=1)
                 own[name] = x
             module.load_state_dict(own)
-    except (KeyError, TypeError, AttributeError, IndexError, RuntimeError) as error:
-        why = " ".join(str(error).split())[:200]
-        raise CheckpointError(f"the weights in {path} do not fit this policy ({why})") from error
-
-
-if __name__ == "__main__":
-    if len(sys.argv) != 3:
-        sys.exit("usage: python checkpoint.py POLICY COPY")
-    try:
-        content = load(sys.argv[1])
-        weights = {k: x.half() if x.dim() > 1 else x for k, x in content["weights"].items()}
-        save({key: content[key] for key in CARD} | {"weights": weights}, Path(sys.argv[2]))
-    except (CheckpointError, KeyError, OSError) as error:
-        sys.exit(f"error: {error}")

@@ -1,7 +1,5 @@
-"""N legged robots in MuJoCo, each with a fault of its own; much like a Gymnasium vector env.
-
-The simulator is `mujoco.batch.Batch`; this file adds what the paper's section III and legged_gym
-define around it: observations, commands, resets, pushes, terminations.
+"""N legged robots in `mujoco.batch.Batch`, each with a fault of its own, like a Gymnasium vector
+env: observations, commands, resets, pushes, terminations of the paper's section III and legged_gym.
 
 Legend: N robots, L legs, J joints a leg, H = 10 steps of history. Numpy, float32 out.
 What a policy sees (`Observation`); the numbers are those of J = 3 joints a leg:
@@ -18,15 +16,14 @@ What a policy sees (`Observation`); the numbers are those of J = 3 joints a leg:
 
 All of it is in *leg frames*: what a left leg sees and does is mirrored, so that a number means the
 same motion and push on every leg, and what one leg learns holds on the other side, too (NOTES 1).
-Right legs, such as the first one, see the trunk's own numbers. Scaled, a walk's are about 1.
-What only some read (`privileged`: critics, RMA's base) is empty, (N, 0), unless in `extras`:
-    privileged (N, 2*L*J + 1)   is the joint locked, its motor's strength, the friction     1
-    heights    (N, 16, 12)      s_e: trunk z - 0.5 m - ground z at the scandots, +-1 m      5
+Right legs see the trunk's own numbers. What only some read is empty, (N, 0), unless in `extras`:
+    privileged (N, 2*L*J+1+M)   locked joints, motors' strength, friction, M other harms    1
+    heights    (N, 16, 12)      s_e: trunk z - 0.3 m - ground z at the scandots, +-1 m      20
     past       (N, L, 50, 21)   as `legs`, 50 steps long                                    as above
     situation  (N, 1)           index of the robot's fault among the env's `faults`         1
 
-What rewards and users may read after a step (attributes; copy what you keep, some are the env's
-memory; of a robot whose episode has ended, all but the contacts are the next episode's):
+What rewards and users may read after a step (attributes; copy what you keep; of a robot whose
+episode has ended, all but contacts, which are the old one's, are already the next episode's):
     command, linear_velocity, angular_velocity, gravity (N, 3)  as above, unscaled
     joint_error, joint_velocity, torque (N, L, J)               rad, rad/s, N m, in URDF frames
     action, last_action (N, L, J)                               in leg frames
@@ -34,18 +31,19 @@ memory; of a robot whose episode has ended, all but the contacts are the next ep
     position (N, 3) m, yaw (N,) rad                             the trunk in the world
 """
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 
 import mujoco
 import numpy as np
+import torch
 from mujoco.batch import Batch
 
-from faults import Fault, healthy, props, write_fault
-from noise import NoisyScan, ScanNoise
+from faults import HEALTHY, FaultWriter, other_harms, props
+from noise import NoisyScan
 from rewards import FALL, total_reward
 from robots import PHYSICS_DT, ROBOTS, Robot, build_model
 from rolt import HISTORY, Observation
-from terrain import Terrain
+from terrain import TILE, Terrain
 
 mujoco.set_mju_user_warning(lambda message: None)  # counted in `_diverged`, not logged
 SUBSTEPS = 4  # legged_gym: 50 Hz control
@@ -59,10 +57,8 @@ MAX_ACTION = 10.0  # ours: 2.5 rad (hexapod: 1.5) off the default pose, far more
 MAX_SPEED = 1000.0  # m/s, rad/s, ours: flailing at the motors' limits reaches 100
 MAX_TILT = np.cos(np.deg2rad(60))  # ours: past it none gets up again; legged_gym waits for contact
 EXTRAS = ("privileged", "heights", "past", "situation")
-SAVED = (
-    "action", "last_action", "history", "command", "heading", "air_time", "age", "first_age",
-    "command_age", "episode_return", "fault_index", "_last_contact", "row", "start",
-)  # fmt: skip
+SAVED = """action last_action history command heading air_time age first_age command_age
+    episode_return fault_index _last_contact row start""".split()
 
 
 @dataclass(frozen=True)
@@ -83,14 +79,6 @@ class EnvConfig:
     start_rows: int = 3  # of the terrain, on which robots begin, ours (legged_gym: 6 of 10)
     climb: bool = True  # from row to row by the curriculum; False = always start on the first rows
 
-    def __post_init__(self):
-        for name, value in asdict(self).items():
-            low, high = value if isinstance(value, tuple) else (0, value)
-            if not -np.inf < low <= high < np.inf:
-                raise ValueError(f"{name} is {value}; ranges: (low, high), others >= 0, all finite")
-            if name.endswith("_seconds") and value < CONTROL_DT:
-                raise ValueError(f"{name} is {value}; a control step already lasts {CONTROL_DT} s")
-
 
 class LocomotionEnv:
     """N robots of one kind; robot i's episode ends, and is restarted by `step`, on its own.
@@ -99,19 +87,15 @@ class LocomotionEnv:
     faults: (probability, fault) pairs; each reset draws one. Only their boxes and skates exist.
     extras: which of `EXTRAS` the observation holds. None of them changes the simulation.
     terrain: None = flat ground. Robot i stays on column i modulo the number of columns.
-    noise: on the scandots, for tests; from a generator of its own, so that it changes nothing else.
+    noise: on the scandots (noise.py), for tests; has a generator of its own: all else stays.
     """
 
     def __init__(
         self, robot: str | Robot, num_envs: int, seed: int | tuple[int, ...] = 0,
-        num_threads: int = 0, faults: tuple[tuple[float, Fault], ...] = ((1.0, healthy()),),
+        num_threads: int = 0, faults: tuple[tuple[float, str], ...] = ((1.0, HEALTHY),),
         config: EnvConfig = EnvConfig(), extras: tuple[str, ...] = (),
-        terrain: Terrain | None = None, noise: ScanNoise = ScanNoise(),
+        terrain: Terrain | None = None, noise: str = "clean",
     ):  # fmt: skip
-        if isinstance(robot, str) and robot not in ROBOTS:
-            raise ValueError(f"unknown robot {robot!r}; there is {', '.join(ROBOTS)}")
-        if num_envs < 1:
-            raise ValueError(f"num_envs is at least 1, not {num_envs}")
         if unknown := set(extras) - set(EXTRAS):
             raise ValueError(f"unknown extras {', '.join(unknown)}; there is {', '.join(EXTRAS)}")
         self.robot = robot = ROBOTS[robot] if isinstance(robot, str) else robot
@@ -122,23 +106,21 @@ class LocomotionEnv:
         self.rng = np.random.default_rng(seed)
         self.terrain, self.scan = terrain, NoisyScan(num_envs, terrain, noise, seed)
 
-        self.faults = [fault for _, fault in faults]
-        self._fault_odds = np.array([probability for probability, _ in faults])
+        self._fault_odds, self.faults = zip(*faults)
+        self._other_harms = other_harms(self.faults)  # (faults, M)
         self.model = model = build_model(robot, terrain, **props(self.faults))
         self.world = world = Batch(model, nsim=num_envs, nthread=num_threads, persistent=True)
         self._qpos, self._qvel, self._ctrl = map(world.bind, ("qpos", "qvel", "ctrl"))
         self._torque, self._contacts = map(world.bind, ("actuator_force", "sensordata"))
-        self._friction = world.expand("geom_friction")
-        names = [model.sensor(i).name.removeprefix("contact_") for i in range(model.nsensor)]
-        self._trunk_sensor = names.index("trunk")
-        self._foot_sensors = [names.index(f"{leg}_foot") for leg in robot.legs]
-        self._link_sensors = [i for i, name in enumerate(names) if name in robot.joints]
+        self._friction, self.fault_writer = world.expand("geom_friction"), FaultWriter(robot, world)
+        self._geoms = model.sensor_objid  # the robot's own: 0 the trunk, then each leg's
+        self._foot_sensors = feet = [model.sensor(f"contact_{leg}_foot").id for leg in robot.legs]
+        self._link_sensors = [i for i in range(1, model.nsensor) if i not in feet]
         self._joints = joints = np.array([model.joint(name).id for name in robot.joints])  # (L*J,)
         self._angle_at, self._velocity_at = model.jnt_qposadr[joints], model.jnt_dofadr[joints]
         self._default = np.array(robot.default_pose)  # (L, J)
 
-        # Leg frames: a mount with y > 0 is a left leg's. In its mirror image a turn about y stays
-        # as it is, and one about x or z turns the other way. All signs 1 are the URDF's frames.
+        # Leg frames: y > 0 is left, and mirrored: there a turn about x or z goes the other way.
         left = (np.array([y for _, y, _ in robot.mounts]) > 0) & config.leg_frames  # (L,)
         turned = np.array([link.axis[1] == 0 for link in robot.links])  # (J,)
         self._joint_sign = np.where(left[:, None] & turned, -1.0, 1.0)  # (L, J)
@@ -157,11 +139,10 @@ class LocomotionEnv:
         self.row, self.start = np.zeros(num_envs, dtype=int), np.zeros((num_envs, 2))  # m
         self.column = np.arange(num_envs) % (len(terrain.columns) if terrain else 1)
 
-    def pin_faults(self, faults: list[Fault]) -> None:
+    def pin_faults(self, faults: list[str]) -> None:
         """Robot i has faults[i] in every episode from its next reset on, for tests."""
-        if len(faults) != self.num_envs:
-            raise ValueError(f"{len(faults)} faults for {self.num_envs} robots")
         self.faults, self.fault_index, self._pinned = list(faults), np.arange(self.num_envs), True
+        self._other_harms = other_harms(self.faults)
 
     def reset(self, random_ages: bool = False) -> Observation:
         """Starts an episode on every robot. `random_ages`: their ends are spread (legged_gym)."""
@@ -179,8 +160,7 @@ class LocomotionEnv:
     def step(self, action: np.ndarray) -> tuple:
         """One control step of 20 ms, to joint targets default pose + action_scale * action. Actions
         are (N, L*J) or (N, L, J), in leg frames, and are clipped to +-10. Returns:
-            observation: of a robot whose episode ended, the first one of its next episode.
-            reward: (N,) float32.
+            observation: of a robot whose episode ended, its next one's. reward: (N,) float32.
             terminated: (N,) bool, fallen (trunk on the ground, tilt over 60 degrees) or diverged.
             truncated: (N,) bool, the time was up.
             info: of the state before any reset: "rewards" {term: (N,)} weighted, per second,
@@ -188,27 +168,23 @@ class LocomotionEnv:
                 bool; of time-outs "truncated_ids" (n,) and "final_observation" (n rows) to
                 bootstrap from; of all ended "episode_returns", "episode_lengths" (n,), in steps.
         """
-        if not hasattr(self, "position"):
-            raise RuntimeError("the env has no state yet: call reset() before the first step")
-        action = np.asarray(action, dtype=np.float64)
-        flat = (self.num_envs, self.num_actions)
-        if action.shape not in (flat, self.action.shape):
-            raise ValueError(f"actions are {flat}, not {action.shape}")
-        action = action.reshape(self.action.shape)
+        if action.shape not in (self._ctrl.shape, self.action.shape):
+            raise ValueError(f"actions are {self._ctrl.shape}, not {action.shape}")
+        action = action.astype(np.float64).reshape(self.action.shape)
         if not np.isfinite(action).all():
             raise FloatingPointError("an action is not finite: its policy has diverged")
         self.last_action, self.action = self.action, np.clip(action, -MAX_ACTION, MAX_ACTION)
         target = self._default + self.robot.action_scale * self._joint_sign * self.action  # rad
-        self._ctrl[:] = target.reshape(flat)
+        self._ctrl[:] = target.reshape(self._ctrl.shape)
         self.world.step(nstep=SUBSTEPS, stage=mujoco.mjtStage.mjSTAGE_VEL)
         self.age += 1
         self.command_age += 1
 
         diverged = self._diverged()
         self._read_state()
-        self._read_feet()
+        self._read_contacts()
         reward, terms = total_reward(self, CONTROL_DT)
-        fallen = (self._contacts[:, self._trunk_sensor] > 0) | (self.gravity[:, 2] > -MAX_TILT)
+        fallen = (self._contacts[:, 0] > 0) | (self.gravity[:, 2] > -MAX_TILT)  # 0: the trunk's
         reward = np.where(diverged, 0.0, reward + FALL * fallen)
         self.episode_return += reward
         terminated = fallen | diverged
@@ -224,7 +200,7 @@ class LocomotionEnv:
 
         ended, late = np.flatnonzero(terminated | truncated), np.flatnonzero(truncated)
         info |= {"truncated_ids": late, "final_observation": self.observe(late)}
-        info["episode_returns"] = self.episode_return[ended].copy()
+        info["episode_returns"] = self.episode_return[ended]
         info["episode_lengths"] = (self.age - self.first_age)[ended]
         if len(ended):
             self._climb(ended[~diverged[ended]])  # a diverged one is nowhere
@@ -239,8 +215,7 @@ class LocomotionEnv:
         if "privileged" in self.extras:
             extra["privileged"] = self._privileged()[ids]
         if "heights" in self.extras:
-            everyone = np.arange(self.num_envs)
-            extra["heights"] = self.scan.read(everyone[ids], self.position[ids], self.yaw[ids])
+            extra["heights"] = self.scan.read(ids, self.position[ids], self.yaw[ids])
         if "past" in self.extras:
             extra["past"] = history.copy()
         if "situation" in self.extras:
@@ -248,19 +223,19 @@ class LocomotionEnv:
         return Observation(history[:, :, -HISTORY:].copy(), action, **extra)
 
     def state_dict(self) -> dict:
-        """All that the next step depends on, but for noise on the scan, which is for tests."""
-        arrays = {name: getattr(self, name).copy() for name in SAVED}
-        arrays |= {"world": self.world.state.copy(), "friction": self._friction.copy()}
-        return arrays | {"random": self.rng.bit_generator.state}
+        """All that the next step depends on but noise on the scan. Tensors: safe for torch.load."""
+        arrays = {name: getattr(self, name) for name in SAVED}
+        arrays |= {"world": self.world.state, "friction": self._friction}
+        tensors = {name: torch.tensor(array) for name, array in arrays.items()}  # copies
+        return tensors | {"random": self.rng.bit_generator.state}
 
     def load_state_dict(self, state: dict) -> None:
         """The inverse, for an env of the same arguments and the same pinned faults."""
         for name in SAVED:
             getattr(self, name)[...] = state[name]
         self.rng.bit_generator.state = state["random"]
-        for index in np.unique(self.fault_index):
-            ids = np.flatnonzero(self.fault_index == index)
-            write_fault(self.faults[index], self.robot, self.world, ids)
+        for i, index in enumerate(self.fault_index):
+            self.fault_writer.write(self.faults[index], i)
         self._friction[...] = state["friction"]
         self.world.state[...] = state["world"]
         self.world.forward(stage=mujoco.mjtStage.mjSTAGE_VEL)
@@ -274,17 +249,16 @@ class LocomotionEnv:
             self.fault_index[ids] = self.rng.choice(len(self.faults), size=n, p=self._fault_odds)
         pose = self._default * self.rng.uniform(*config.start_pose, size=(n, *self._default.shape))
         self._qvel[ids, :6] = self.rng.uniform(-config.start_speed, config.start_speed, size=(n, 6))
-        self._friction[ids, :, 0] = self.rng.uniform(*config.friction, size=(n, 1))
-        for index in np.unique(self.fault_index[ids]):
-            same = ids[self.fault_index[ids] == index]
-            write_fault(self.faults[index], self.robot, self.world, same)
-
+        friction = self.rng.uniform(*config.friction, size=(n, 1, 1))
+        self._friction[np.ix_(ids, self._geoms, [0])] = friction
+        for i in ids:
+            self.fault_writer.write(self.faults[self.fault_index[i]], i)
         locked = self.world.bind("eq_active")[ids] > 0
         limits = self.world.expand("jnt_range")[ids][:, self._joints]
         pose = np.clip(pose.reshape(n, -1), limits[:, :, 0], limits[:, :, 1])
         self._qpos[ids[:, None], self._angle_at] = np.where(locked, self._default.reshape(-1), pose)
         if self.terrain:
-            self.start[ids] = self.terrain.start(self.row[ids], self.column[ids])
+            self.start[ids] = TILE * np.stack([self.row[ids], self.column[ids]], axis=1)
             self.start[ids, 1] += self.rng.uniform(-1, 1, size=n)  # m to the side, legged_gym
             self._qpos[ids, :2] = self.start[ids]
         self.scan.draw(ids)
@@ -326,10 +300,9 @@ class LocomotionEnv:
     def _diverged(self) -> np.ndarray:
         """(N,) bool: MuJoCo warns (it resets most such) or it ran away. All states finite after."""
         slow = np.abs(self._qvel).max(axis=1) < MAX_SPEED  # NaN is not <
-        tame = slow & np.isfinite(self._qpos).all(axis=1)
-        if not tame.all():
-            self.world.reset(np.flatnonzero(~tame), keyframe=0, stage=mujoco.mjtStage.mjSTAGE_VEL)
-        return ~tame | (self.world.warning[:, :, 1] > 0).any(axis=1)
+        wild = ~(slow & np.isfinite(self._qpos).all(axis=1))
+        self.world.reset(np.flatnonzero(wild), keyframe=0, stage=mujoco.mjtStage.mjSTAGE_VEL)
+        return wild | (self.world.warning[:, :, 1] > 0).any(axis=1)
 
     def _read_state(self) -> None:
         """The table's terms. qvel is linear in the world's frame and angular in the trunk's."""
@@ -347,10 +320,10 @@ class LocomotionEnv:
         self.joint_error = self._qpos[:, self._angle_at].reshape(shape) - self._default
         self.joint_velocity = self._qvel[:, self._velocity_at].reshape(shape)
         self.torque = self._torque.reshape(shape)
-        self.link_contact = self._contacts[:, self._link_sensors] > 0
 
-    def _read_feet(self) -> None:
-        """Contacts are held for a step: a foot in the air for one has not stepped (legged_gym)."""
+    def _read_contacts(self) -> None:
+        """Feet's are held for a step: one in the air for a step has not stepped (legged_gym)."""
+        self.link_contact = self._contacts[:, self._link_sensors] > 0
         contact = self._contacts[:, self._foot_sensors] > 0
         self.foot_contact = contact | self._last_contact
         self._last_contact = contact
@@ -368,8 +341,9 @@ class LocomotionEnv:
         return np.concatenate(parts, axis=2, dtype=np.float32)
 
     def _privileged(self) -> np.ndarray:
-        """(N, 2*L*J + 1), what no robot can measure."""
+        """(N, 2*L*J + 1 + M), what no robot can measure."""
         locked = self.world.bind("eq_active")
-        force = self.world.expand("actuator_forcerange")[:, :, 1]
-        motors = force / self.model.actuator_forcerange[:, 1]
-        return np.concatenate([locked, motors, self._friction[:, 0, :1]], axis=1, dtype=np.float32)
+        motors = self.world.expand("actuator_forcerange") / self.model.actuator_forcerange
+        friction = self._friction[:, self._geoms[:1], 0]
+        parts = locked, motors[:, :, 1], friction, self._other_harms[self.fault_index]
+        return np.concatenate(parts, axis=1, dtype=np.float32)

@@ -4,10 +4,10 @@
     python evaluate.py gaits --methods rolt --episodes 8 --seconds 10 --out /tmp/quick
     python evaluate.py watch        # a policy to look at while it walks (watch.py)
 
-Each prints a table and writes EXPERIMENT.csv and EXPERIMENT.png to --out; one row an episode where
-robots walk. Several seeds of a method (NAME.pt, NAME-seed1.pt, ... in checkpoints/) are put
-together: a cell is the mean over seeds, and over the episodes of each. Policies act by their mean,
-without dropout (ROAM draws which of its behaviours acts). The same seed gives the same numbers.
+Each prints a table and writes EXPERIMENT.csv (mostly a row an episode) and EXPERIMENT.png to --out.
+A cell is the mean over the seeds of a method (checkpoints/NAME.pt, NAME-seed1.pt, ...) and over the
+episodes of each. Policies act by their mean, without dropout; ROAM draws a behaviour. attention,
+mechanisms and dropout_ratio ignore --episodes and --seconds. The same --seed, the same numbers.
 """
 
 import argparse
@@ -22,74 +22,97 @@ import torch
 import plots
 import watch
 from baselines import METHODS
-from checkpoint import CheckpointError, load_policy
-from env import CONTROL_DT, LocomotionEnv, Observation
-from faults import REAL_WORLD, TASKS, first_task, healthy
-from noise import HEIGHT_SCALE, NUM_PATCHES, ScanNoise, as_patches, missing_points
-from ppo import Critic, PPOConfig, RolloutBuffer, collect, gaussian, to_tensors
-from rolt import ROLT
+from checkpoint import load_policy
+from env import CONTROL_DT, LocomotionEnv
+from faults import HEALTHY, REAL_WORLD, TASKS, first_task
+from noise import HEIGHT_SCALE, NoisyScan
+from ppo import Critic, PPOConfig, RolloutBuffer, collect, to_tensors
+from robots import ROBOTS
+from rolt import GRID, NUM_PATCHES, PATCH, ROLT, Observation
 from terrain import Terrain, rise
-from walk import gait, origin, report, straight_ahead, take_a_walk, walk_cases, write_csv
+from walk import by_seed, duty, mean_and_interval, origin, take_a_walk, walk_cases, write_csv
 
 STAIRS_LEVEL = 0  # of the noise tests, ours: steps of 5 cm, the easiest of legged_gym
-STAIRS = Terrain(("stairs",), (STAIRS_LEVEL,) * 3)
 NOISE_SCALES = (0.0, 0.05, 0.1, 0.15, 0.2, 0.3, 0.4)  # m, ours
 GATE = 0.1  # standard deviations of an action, ours: less is no mechanism
-DISTANCE = {"distance_m": "distance walked [m]"}
+WALKED = {"distance_m": "distance walked [m]", "fell": "share of falls", "success": "success"}
 
 
-def bars(args, rows, name: str, speed: float, columns=DISTANCE, marks={}) -> None:
-    """The table, the CSV file and a bar chart of all cases."""
-    title = f"{name}: {args.robot}, {speed:g} m/s, {args.seconds:g} s"
-    panels = report(args, rows, args.experiment, title, columns, marks)
-    cases = [case + marks.get(case, "") for case in dict.fromkeys(row["case"] for row in rows)]
-    plots.bar_charts(panels, cases, args.out / f"{args.experiment}.png", title)
+def report(args, rows: list[dict], columns: dict[str, str], title: str, marks={}, x="") -> None:
+    """Writes EXPERIMENT.csv and .png, prints a table of each of the columns {column: what}: mean
+    over seeds of the mean over episodes (95 % interval). marks: {case: remark}; x: see `chart`."""
+    path = args.out / args.experiment
+    write_csv(path.with_suffix(".csv"), rows)
+    methods, cases = ([*dict.fromkeys(row[key] for row in rows)] for key in ("method", "case"))
+    labels = [case + marks.get(case, "") for case in cases]
+    panels = {}
+    for column, what in columns.items():
+        print(f"\n{title}: {what}\n")
+        print("|", *(f"| {method}" for method in methods), "|")
+        print("|---" * (len(methods) + 1) + "|")
+        panels[what] = {method: [] for method in methods}
+        for case, label in zip(cases, labels):
+            line = f"| {label} |"
+            for method in methods:
+                values = by_seed(rows, column, method=method, case=case)
+                mean, low, high = mean_and_interval(values)
+                panels[what][method].append((mean, low, high, values.mean(axis=1)))
+                line += f" {mean:.2f}" + f" ({low:.2f} to {high:.2f})" * (low < high) + " |"
+            print(line)
+    plots.chart(panels, labels, path.with_suffix(".png"), title, x)
 
 
 def fault_test(args, policies, name: str, case_name) -> None:
-    """One fault at a time, seen in training or not, 0.75 m/s. case_name: the parts of its name."""
+    """One fault at a time, seen in training or not, 0.75 m/s. case_name: of a joint's."""
     task = TASKS[args.task]
-    seen = [fault for _, fault in task.training]
-    cases = {"".join(case_name(fault)) or "healthy": fault for fault in (*seen, *task.unseen)}
-    marks = {case: " (seen)" for case, fault in cases.items() if fault in seen}
+    faults = *task.seen, *task.unseen
+    cases = {case_name(f.split(":")[1]) if f.count(":") == 1 and "_" in f else f: f for f in faults}
+    marks = {case: " (seen)" for case, fault in cases.items() if fault in task.seen}
     rows = walk_cases(args, policies, cases, speed=0.75)
-    columns = DISTANCE | {"fall_time_s": "time of the first fall [s]"}
-    bars(args, rows, f"{name} test", 0.75, columns, marks)
+    report(args, rows, WALKED, f"{name} test: {args.robot}, 0.75 m/s, {args.seconds:g} s", marks)
 
 
 def stiffness(args, policies) -> None:
     """Section IV-A (i), figure "Stiffness test results": one calf locked at a time, 0.75 m/s, 20 s.
-    Unseen in training: FL, RR, RL. In leg frames FL is the mirror image of FR (which was seen), and
-    a policy that is its own mirror image has as good as seen it; the hind legs are the test."""
-    fault_test(args, policies, "Stiffness", lambda f: [joint[:2] for joint in f.locked])
+    In leg frames the unseen FL is the mirror image of FR (seen), so the hind legs are the test."""
+    fault_test(args, policies, "Stiffness", lambda joint: joint[:2])
 
 
 def damage(args, policies) -> None:
     """Section IV-A (ii), table "Damage test results": one dead motor, hexapod, 0.75 m/s, 20 s.
     Cases are named as in the paper: FLC is the calf of the front left leg, T a thigh."""
-    fault_test(args, policies, "Damage", lambda f: [j[:2] + j[3].upper() for j, _ in f.strength])
+    fault_test(args, policies, "Damage", lambda joint: joint[:2] + joint[3].upper())
 
 
 def real_world(args, policies) -> None:
     """Section IV-C, table "Real-world Experiments", simulated: the stiffness task's Go1, 10 s. How
-    weak, how heavy, how smooth is ours, the paper does not say (faults.py, robots.py). Its
-    distances (RMA 0.0, 0.4, 1.2 m; ROLT 2.8, 1.5, 4.8 m) are of a physical Go1 and no target here:
-    what can be compared is whether a method walks on or falls, and how methods rank."""
+    weak, heavy and smooth is ours (faults.py, robots.py). The paper's distances (RMA 0.0, 0.4, 1.2
+    m; ROLT 2.8, 1.5, 4.8 m) are of a physical Go1: compare only who falls, and how methods rank."""
     rows = []
     for case, fault in REAL_WORLD.items():  # one by one: only who needs a box or wheels has them
         rows += walk_cases(args, policies, {case: fault}, speed=0.75)
-    bars(args, rows, "Real-world test, simulated", 0.75)
+    title = f"Real-world test, simulated: {args.robot}, 0.75 m/s, {args.seconds:g} s"
+    report(args, rows, WALKED, title)
+
+
+def on_stairs(args, policies, cases: dict, name: str, x="") -> None:
+    """Healthy, 0.5 m/s, over stairs. cases: {case: (level, noise)}."""
+    rows = []
+    for case, (level, noise) in cases.items():
+        course = {"terrain": Terrain(("stairs",), (level,) * 3), "noise": noise}
+        rows += walk_cases(args, policies, {case: HEALTHY}, 0.5, **course)
+    columns = {"episode_return": "return of an episode"} | WALKED
+    report(args, rows, columns, f"{name}: {args.robot}, 0.5 m/s, {args.seconds:g} s", x=x)
 
 
 def stairs(args, policies) -> None:
     """Not in the paper: does the policy climb, and with its eyes? Stairs of every level of the
-    training at 0.5 m/s, with clean scandots and blind (all of them read zero)."""
-    rows, blind = [], ScanNoise(missing_patches=NUM_PATCHES)
-    for suffix, noise in (("", ScanNoise()), (" blind", blind)):
+    training, with clean scandots and blind (all of them read zero)."""
+    cases = {}
+    for suffix, noise in (("", "clean"), (" blind", f"missing:{NUM_PATCHES}")):
         for level in TASKS["terrain"].terrain.levels:
-            case, course = f"{100 * rise(level):.1f} cm{suffix}", Terrain(("stairs",), (level,) * 3)
-            rows += walk_cases(args, policies, {case: healthy()}, 0.5, terrain=course, noise=noise)
-    bars(args, rows, "Stairs", 0.5)
+            cases[f"{100 * rise(level):.1f} cm{suffix}"] = level, noise
+    on_stairs(args, policies, cases, "Stairs")
 
 
 def low_frequency(args, policies) -> None:
@@ -103,50 +126,41 @@ def high_frequency(args, policies) -> None:
     noise_test(args, policies, "sigma", "High-frequency noise", "deviation of every point [m]")
 
 
-def noise_test(args, policies, kind: str, title: str, axis: str) -> None:
-    """Return and distance on stairs of STAIRS_LEVEL at 0.5 m/s against the scale of the noise."""
-    rows = []
-    for scale in NOISE_SCALES:
-        case, noise = f"{scale:g}", ScanNoise(**{kind: scale})
-        rows += walk_cases(args, policies, {case: healthy()}, 0.5, terrain=STAIRS, noise=noise)
-    cm = 100 * rise(STAIRS_LEVEL)
-    title = f"{title}: {args.robot}, steps of {cm:.1f} cm, 0.5 m/s, {args.seconds:g} s"
-    columns = {"episode_return": "return of an episode"} | DISTANCE
-    panels = report(args, rows, args.experiment, title, columns)
-    plots.curves(panels, NOISE_SCALES, args.out / f"{args.experiment}.png", title, axis)
+def noise_test(args, policies, kind: str, name: str, x: str) -> None:
+    """Against the scale of the noise, on stairs of STAIRS_LEVEL."""
+    cases = {f"{scale:g}": (STAIRS_LEVEL, f"{kind}:{scale}") for scale in NOISE_SCALES}
+    on_stairs(args, policies, cases, f"{name}, steps of {100 * rise(STAIRS_LEVEL):.1f} cm", x)
 
 
-@torch.no_grad()
 def attention(args, policies) -> None:
-    """Figure "Elevation maps and attention maps": where the legs look when patches read zero.
-
-    All methods are shown what the last of them saw 4 s into a walk over stairs of STAIRS_LEVEL,
-    clean and with 4 patches missing. Shown is the attention of the leg tokens on the 12 patches in
-    the last layer, mean over legs and heads, made to add up to 1. Printed: the share of it on those
-    4 patches, and its entropy relative to an even gaze."""
+    """Figure "Elevation maps and attention maps": where the legs look when patches read zero. All
+    policies see what the last of them saw 4 s into a walk over stairs of STAIRS_LEVEL, clean and
+    with 4 patches missing. Shown is the attention of the leg tokens on the 12 patches in the last
+    layer, mean over legs and heads, made to add up to 1; printed, the share of it on those 4
+    patches, and its entropy relative to an even gaze."""
+    if not all(hasattr(policy, "patch_position") for policy, _ in policies.values()):
+        sys.exit("error: attention on patches is of ROLTs that read the scan: choose --checkpoints")
     *_, (walker, _) = policies.values()
-    config, options = straight_ahead(walker, 0.5, 4), {"extras": ("heights",), "terrain": STAIRS}
-    env = LocomotionEnv(args.robot, 1, args.seed, 1, config=config, **options)
-    observation = env.reset()
-    for _ in range(round(4 / CONTROL_DT)):
-        observation, _, fallen, *_ = env.step(walker(to_tensors(observation, "cpu")).numpy())
-        if fallen.any():
-            sys.exit("error: the policy that walks falls within 4 s: try another --seed")
-    missing = missing_points(ScanNoise(missing_patches=4), 1, np.random.default_rng(args.seed))
-    patches, rows, panels = as_patches(missing[0]).any(axis=1), [], {}
-    for title, unread in (("clean", False), ("4 patches missing", missing)):
-        heights = np.where(unread, np.float32(0), observation.heights)
-        panels[title] = {"heights": heights[0] / HEIGHT_SCALE}
-        shown = to_tensors(observation._replace(heights=heights), "cpu")
+    course, seen = Terrain(("stairs",), (STAIRS_LEVEL,) * 3), []
+    how = [HEALTHY], 0.5, 4.0, args.seed, args.threads
+    if take_a_walk(walker, args.robot, *how, seen, terrain=course).fell.any():
+        sys.exit("error: the policy that walks falls within 4 s: try another --seed")
+    blind = NoisyScan(1, None, "missing:4", args.seed)
+    blind.draw(np.array([0]))
+    patches, rows, panels = blind.missing[0, ::PATCH, ::PATCH].ravel(), [], {}
+    for scan, unread in (("clean", False), ("4 patches missing", blind.missing)):
+        heights = np.where(unread, np.float32(0), seen[-1].heights)
+        panels[scan] = {"scandots [m]": heights[0] / HEIGHT_SCALE}
+        shown = to_tensors(seen[-1]._replace(heights=heights), "cpu")
         for path, (policy, card) in policies.items():
             weights = policy.attention(shown)[0, -1, :, :, -NUM_PATCHES:].mean((0, 1)).numpy()
             weights /= weights.sum()
-            share, method = weights[patches].sum(), card["policy"]
+            panels[scan][card["policy"]] = weights.reshape(GRID)
+            share = weights[patches].sum()
             entropy = -(weights * np.log(weights)).sum() / np.log(NUM_PATCHES)
-            panels[title][method] = weights
-            row = {"method": method, "seed": card["seed"], "scan": title, "checkpoint": str(path)}
-            rows.append(row | {"share_of_4_patches": f"{share:.4f}", "entropy": f"{entropy:.4f}"})
-            print(f"{method:18}{title:20} on the 4 patches {share:6.1%}, entropy {entropy:.3f}")
+            row = {"scan": scan, "share_of_4_patches": f"{share:.4f}", "entropy": f"{entropy:.4f}"}
+            print(f"{card['policy']:18}{scan:20} on 4 patches {share:6.1%}, entropy {entropy:.3f}")
+            rows.append(origin(path, card) | row)
     write_csv(args.out / "attention.csv", rows)
     plots.attention_maps(panels, args.out / "attention.png")
 
@@ -154,84 +168,63 @@ def attention(args, policies) -> None:
 def gaits(args, policies) -> None:
     """Figure "Unstructured gaits": which foot is down when, for every fault of the robot's task.
     Drawn: the last second of a case's first episode. Numbers: all of its episodes, from 2 s on."""
-    task, rows, panels = TASKS[first_task(args.robot)], [], []
-    cases = {str(fault): fault for fault in (*(fault for _, fault in task.training), *task.unseen)}
-    faults = [fault for fault in cases.values() for _ in range(args.episodes)]
+    task, rows, panels, n = TASKS[args.task], [], [], args.episodes
+    cases = *task.seen, *task.unseen
+    faults = [fault for fault in cases for _ in range(n)]
     for path, (policy, card) in policies.items():
         walk = take_a_walk(policy, args.robot, faults, 0.75, args.seconds, args.seed, args.threads)
         legs = walk.env.robot.legs
-        words = "".join(f"{leg:>6}" for leg in legs)
-        print(f"\n{card['policy']:24}  feet down  strides/s    duty{words}")
-        none = np.full(len(legs), np.nan)
-        for first, case in zip(range(0, len(faults), args.episodes), cases):
-            found = [one for i in range(args.episodes) if (one := gait(walk, first + i))]
-            found = found or [{"duty": none, "stride_hz": none, "feet_down": none}]
-            duty, stride, feet = (np.mean([one[key] for one in found], axis=0) for key in found[0])
-            words = "".join(f"{share:6.2f}" for share in duty)
-            print(f"{case:24}{feet.mean():11.2f}{stride.mean():11.2f}{duty.mean():8.2f}{words}")
-            for leg, share, hz in zip(legs, duty, stride):
-                row = {"case": case, "leg": leg, "duty": f"{share:.3f}", "stride_hz": f"{hz:.3f}"}
-                rows.append(origin(path, card) | row)
-            end = walk.steps[first]
-            shown = walk.contacts[max(0, end - round(1 / CONTROL_DT)) : end, first]
+        print(f"\n{card['policy']:24}", *(f"{leg:>5}" for leg in legs), " of the time down")
+        for first, case in zip(range(0, len(faults), n), cases):
+            shares = duty(walk, range(first, first + n))
+            print(f"{case:24}", *(f"{share:5.2f}" for share in shares))
+            row = origin(path, card) | {"case": case}
+            rows += [row | {"leg": leg, "duty": f"{x:.3f}"} for leg, x in zip(legs, shares)]
+            shown = walk.contacts[: walk.steps[first], first][-round(1 / CONTROL_DT) :]
             panels.append((f"{card['policy']}, {case}", shown))
-    write_csv(args.out / f"gaits-{args.robot}.csv", rows)
-    title, picture = f"Gaits: {args.robot}, feet on the ground, 1 s", f"gaits-{args.robot}.png"
-    plots.gait_diagrams(panels, legs, CONTROL_DT, len(policies), args.out / picture, title)
+    write_csv(args.out / "gaits.csv", rows)
+    picture, name = args.out / "gaits.png", f"Gaits: {args.robot}, feet on the ground, 1 s"
+    plots.gait_diagrams(panels, legs, CONTROL_DT, len(policies), picture, name)
 
 
-@torch.no_grad()
 def mechanisms(args, policies) -> None:
-    """Is what the claims rest on alive? In states of a healthy walk, how much each method's actions
-    change, in units of their standard deviation, when a part of it is disturbed (`disturbances`).
-    An ablation is worth comparing only if what it takes away changes actions by 0.1 or more. Then
-    how well a linear probe names a leg from its history (by chance 1 in L), and each foot's share
-    of the time on the ground: a fault on a leg hardly used (below 0.1) tests nothing."""
+    """Is what the claims rest on alive? How much a method's actions change in a healthy walk, in
+    their standard deviations, when a part of it is disturbed: an ablation is worth comparing if it
+    takes away 0.1 or more. Then how well a linear probe names a leg from its history (by chance 1
+    in L), and each foot's share of the time down: a fault on a leg below 0.1 tests nothing."""
     rows = []
     for path, (policy, card) in policies.items():
         course = Terrain(("stairs",), (-1,) * 3) if card["task"] == "terrain" else None
-        states, duty = walking_states(policy, args, course)
-        actions, numbers = policy(states), {}
+        how, seen = ([HEALTHY] * 32, 0.5 if course else 0.75, 6.0, args.seed, args.threads), []
+        walk = take_a_walk(policy, args.robot, *how, seen, terrain=course)
+        up = ~walk.fell | walk.fell.all()  # all, if none stays up
+        fields = zip(*(seen[100::10] or seen))  # every tenth step from 2 s on
+        states = Observation(*(torch.tensor(np.array(x)[:, up]).flatten(0, 1) for x in fields))
+        shares = zip(walk.env.robot.legs, duty(walk, range(32)))
+        numbers = {f"duty of {leg}": share for leg, share in shares}
+        actions = policy(states)
         for name, other in disturbances(policy, states):
             change = (policy(other) - actions) / actions.std(0)
             numbers[name] = change.square().mean().sqrt().item()
         numbers["leg named by its history"] = leg_probe(states.legs)
-        numbers |= {f"duty of {leg}": share for leg, share in duty.items()}
-        print(f"\n{card['policy']}, seed {card['seed']}")
-        for name, value in numbers.items():
-            dead = value < GATE and name != "leg named by its history"
-            print(f"  {name:26}{value:8.3f}{'   hardly any' if dead else ''}")
-            rows.append(origin(path, card) | {"probe": name, "value": f"{value:.4f}"})
-    write_csv(args.out / "mechanisms.csv", rows)
-    plots.probe_bars(rows, GATE, args.out / "mechanisms.png")
-
-
-def walking_states(policy, args, terrain: Terrain | None) -> tuple[Observation, dict[str, float]]:
-    """What 32 healthy robots see in 4 s of walking, every tenth step of those that stay up (of all
-    if none does); and the duty factor of each leg."""
-    seen, faults, speed = [], [healthy()] * 32, 0.5 if terrain else 0.75
-    hook = policy.register_forward_pre_hook(lambda _, inputs: seen.append(inputs[0]))
-    walk = take_a_walk(policy, args.robot, faults, speed, 6.0, args.seed, 1, terrain=terrain)
-    hook.remove()
-    up = torch.from_numpy(~walk.fell if not walk.fell.all() else walk.fell)
-    states = Observation(*(torch.cat([x[up] for x in field]) for field in zip(*seen[100::10])))
-    legs, found = walk.env.robot.legs, [one["duty"] for i in range(32) if (one := gait(walk, i))]
-    shares = np.mean(found, axis=0) if found else np.full(len(legs), np.nan)
-    return states, dict(zip(legs, shares.tolist()))
+        row = origin(path, card)
+        rows += [row | {"case": name, "value": f"{x:.4f}"} for name, x in numbers.items()]
+    columns = {"value": "change of the actions [their deviation]; share"}
+    report(args, rows, columns, f"Mechanisms: {args.robot}")
+    dead = [f"{row['method']}, {row['case']}" for row in rows if float(row["value"]) < GATE]
+    print(f"\nbelow the gate of {GATE}:", "; ".join(dead) or "nothing")
 
 
 def disturbances(policy, states: Observation):
     """(what, the observation or the policy so disturbed), of those that the policy has."""
-    batch = len(states.legs)
-    other = torch.arange(batch).roll(batch // 2)  # another robot's, at another time
+    other = torch.arange(len(states.legs)).roll(len(states.legs) // 2)  # another robot's
     if states.heights.numel():
         yield "scan turned round", states._replace(heights=states.heights.flip(1))
         yield "another's scan", states._replace(heights=states.heights[other])
     yield "another's action token", states._replace(action=states.action[other])
     yield "another's legs", states._replace(legs=states.legs[other])
     for part in ("patch", "leg"):
-        position = getattr(policy, f"{part}_position", None)
-        if position is not None:
+        if (position := getattr(policy, f"{part}_position", None)) is not None:
             kept = position.clone()
             position.copy_(position.mean(0).expand_as(position))
             yield f"{part} positions equal", states
@@ -242,84 +235,79 @@ def leg_probe(legs: torch.Tensor) -> float:
     """Share of (B, L, H, frame) histories whose leg a linear fit to their first half can name."""
     B, L = legs.shape[:2]
     x = torch.cat([legs.flatten(2), torch.ones(B, L, 1)], dim=2).double()
-    target = torch.eye(L).expand(B, L, L).double()
-    a, b = x[: B // 2].flatten(0, 1), target[: B // 2].flatten(0, 1)
+    a, b = x[: B // 2].flatten(0, 1), torch.eye(L).double().repeat(B // 2, 1)
     weights = torch.linalg.solve(a.T @ a + 1e-2 * len(a) * torch.eye(a.shape[1]).double(), a.T @ b)
     named = (x[B // 2 :] @ weights).argmax(2)
     return (named == torch.arange(L)).double().mean().item()
 
 
-@torch.no_grad()
 def dropout_ratio(args, policies) -> None:
     """Not in the paper, but its case for consistency (section III-C) in one picture: PPO's ratio
-    before any weight has moved, where it should be 1. The first policy collects a rollout at each
-    rate of feature dropout. The update's probability of the same actions is computed with the
-    stored masks (consistent dropout), fresh ones (ordinary dropout) and none (Roll-Drop)."""
-    (policy, _), *_ = policies.values()
-    rows, quantiles = [], torch.tensor([0.05, 0.5, 0.95])
-    print(f"{'masks':10}{'rate':>8}{'5 %':>10}{'median':>10}{'95 %':>10}{'clipped':>10}")
+    before any weight has moved, where it should be 1. The first policy collects a rollout at every
+    rate; the update has its masks (consistent dropout), fresh (ordinary) or none (Roll-Drop)."""
+    (policy, card), *_ = policies.values()
+    if not isinstance(policy, ROLT):
+        sys.exit(f"error: {card['policy']} is no ROLT and has no feature dropout")
+    rows, faults, extras = [], TASKS["stiffness"].training, (*policy.extras, "privileged")
     for rate in (1e-4, 1e-3, 1e-2, 0.05, 0.1, 0.2):
         config = replace(policy.config, feature_dropout=rate)
         model = ROLT(policy.num_legs, policy.num_joints, config)
         model.load_state_dict(policy.state_dict())
-        for scheme, ratio in ratios(model, args).items():
-            low, median, high = ratio.quantile(quantiles).tolist()
+        env = LocomotionEnv(args.robot, 64, args.seed, 1, faults, extras=extras)
+        observation = env.reset(random_ages=True)
+        generator = torch.Generator().manual_seed(args.seed)
+        critic, masks = Critic(observation), model.sample_masks(64, generator)
+        buffer = RolloutBuffer(PPOConfig.steps, observation, env.num_actions, masks, "cpu")
+        for _ in range(2):  # what counts is the second, after half a second of walking
+            observation, _ = collect(env, model, critic, buffer, observation, generator)
+        batch = buffer.minibatch(torch.arange(len(buffer)))
+        fresh = model.sample_masks(len(buffer), generator)
+        schemes = {"stored masks": batch["masks"], "fresh masks": fresh, "no masks": None}
+        for scheme, masks in schemes.items():
+            actions = torch.distributions.Normal(model(batch["observation"], masks), buffer.std)
+            ratio = (actions.log_prob(batch["action"]).sum(-1) - batch["log_prob"]).exp()
             clipped = ((ratio - 1).abs() > PPOConfig.clip).float().mean().item()
-            row = {"masks": scheme, "rate": rate, "low": low, "median": median, "high": high}
-            rows.append(row | {"clipped": clipped})
-            print(f"{scheme:10}{rate:8g}{low:10.4f}{median:10.4f}{high:10.4f}{clipped:10.1%}")
-    write_csv(args.out / "dropout_ratio.csv", rows)
-    title = "PPO's ratio before any weight has moved (5 % to 95 % of samples)"
-    plots.ratio_bands(rows, args.out / "dropout_ratio.png", title)
+            off = ratio.log().abs().median().exp().item()
+            row = {"method": scheme, "seed": card["seed"], "case": f"{rate:g}"}
+            rows.append(row | {"clipped": f"{clipped:.4f}", "off_by": f"{off:.4f}"})
+    columns = {"off_by": "factor by which the ratio is off (median)", "clipped": "share clipped"}
+    report(args, rows, columns, "PPO's ratio before any weight has moved", x="feature dropout rate")
 
 
-def ratios(policy: ROLT, args, num_envs: int = 64) -> dict[str, torch.Tensor]:
-    """{scheme: (samples,) PPO's ratio} of a rollout, the second: after half a second of walking."""
-    task, extras = TASKS["stiffness"].training, (*policy.extras, "privileged")
-    env = LocomotionEnv(args.robot, num_envs, args.seed, 1, task, extras=extras)
-    observation, generator = env.reset(random_ages=True), torch.Generator().manual_seed(args.seed)
-    critic, masks = Critic(observation), policy.sample_masks(num_envs, generator)
-    buffer = RolloutBuffer(PPOConfig.steps, observation, env.num_actions, masks, "cpu")
-    for _ in range(2):
-        observation, _ = collect(env, policy, critic, buffer, observation, generator)
-    batch = buffer.minibatch(torch.arange(len(buffer)))
-    fresh, ratio = policy.sample_masks(len(buffer), generator), {}
-    for scheme, masks in (("stored", batch["masks"]), ("fresh", fresh), ("none", None)):
-        actions = gaussian(policy(batch["observation"], masks), buffer.std)
-        ratio[scheme] = (actions.log_prob(batch["action"]).sum(-1) - batch["log_prob"]).exp()
-    return ratio
-
-
-# name -> (function, the task whose checkpoints it tests, default robot, default seconds)
+# name -> (function, task of its checkpoints (None: the robot's first), default robot and methods)
 EXPERIMENTS = {
-    "stiffness": (stiffness, "stiffness", "a1", 20.0),
-    "damage": (damage, "damage", "hexapod", 20.0),
-    "real_world": (real_world, "stiffness", "go1", 10.0),
-    "stairs": (stairs, "terrain", "a1", 20.0),
-    "low_frequency": (low_frequency, "terrain", "a1", 20.0),
-    "high_frequency": (high_frequency, "terrain", "a1", 20.0),
-    "attention": (attention, "terrain", "a1", 4.0),
-    "gaits": (gaits, None, "a1", 10.0),  # of the robot's first task
-    "mechanisms": (mechanisms, None, "a1", 6.0),
-    "dropout_ratio": (dropout_ratio, "stiffness", "a1", 1.0),
+    "stiffness": (stiffness, "stiffness", "a1", METHODS),
+    "damage": (damage, "damage", "hexapod", METHODS),
+    "real_world": (real_world, "stiffness", "go1", METHODS),
+    "stairs": (stairs, "terrain", "a1", METHODS),
+    "low_frequency": (low_frequency, "terrain", "a1", METHODS),
+    "high_frequency": (high_frequency, "terrain", "a1", METHODS),
+    "attention": (attention, "terrain", "a1", ("rolt", "no-pe-drop", "no-feature-drop")),
+    "gaits": (gaits, None, "a1", METHODS),
+    "mechanisms": (mechanisms, None, "a1", METHODS),
+    "dropout_ratio": (dropout_ratio, "stiffness", "a1", ("rolt",)),
 }
-ONE_SEED = ("attention", "gaits", "dropout_ratio")
-# the methods that have what is looked at; elsewhere all
-SUITABLE = {"attention": ("rolt", "no-pe-drop", "no-feature-drop"), "dropout_ratio": ("rolt",)}
 
 
-def find_policies(args) -> dict[Path, tuple]:
+def find_policies(args, methods) -> dict[Path, tuple]:
     """{path: (policy, card)} of --checkpoints, or of what checkpoints/ holds for this test."""
     paths, stem = args.checkpoints or [], f"{args.robot}-{args.task}"
     if not paths:
         folder = Path(__file__).parent / "checkpoints"
-        for method in args.methods or SUITABLE.get(args.experiment, METHODS):
+        for method in args.methods or methods:
             paths += sorted(folder.glob(f"{stem}-{method}.pt"))
-            if args.experiment not in ONE_SEED:
-                paths += sorted(folder.glob(f"{stem}-{method}-seed*.pt"))
+            paths += sorted(folder.glob(f"{stem}-{method}-seed*.pt"))
     if not paths:
         sys.exit(f"error: no such checkpoints/{stem}-METHOD.pt: train one or name --checkpoints")
-    return {Path(os.path.relpath(path)): load_policy(path, args.robot) for path in paths}
+    found = {Path(os.path.relpath(path)): load_policy(path, args.robot) for path in paths}
+    names = [(card["policy"], card["seed"]) for _, card in found.values()]
+    if len(set(names)) < len(names):  # how a policy grew: told apart by their steps
+        for _, card in found.values():
+            card["policy"] += f" {card['steps'] / 1e6:g}M"
+    names = [(card["policy"], card["seed"]) for _, card in found.values()]
+    if len(set(names)) < len(names):
+        sys.exit("error: two of the checkpoints are of the same method, seed and steps")
+    return found
 
 
 def main(argv: list[str] | None = None) -> None:
@@ -330,33 +318,30 @@ def main(argv: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, **plain)
     add = parser.add_argument
     add("experiment", choices=EXPERIMENTS)
-    add("--robot", help="default: the one that the test is for")
-    add("--methods", nargs="+", choices=METHODS, help="of the shipped checkpoints (default: all)")
-    add("--checkpoints", nargs="+", type=Path, metavar="FILE", help="instead of the shipped ones")
+    add("--robot", choices=ROBOTS, help="default: the one that the test is for")
+    which = parser.add_mutually_exclusive_group().add_argument
+    which("--methods", nargs="+", choices=METHODS, help="of the shipped policies (default: all)")
+    which("--checkpoints", nargs="+", type=Path, metavar="FILE", help="instead of the shipped ones")
     add("--episodes", type=int, default=32, help="a case (default 32)")
     add("--seconds", type=float, help="an episode (default: the paper's 20; real_world, gaits 10)")
     add("--seed", type=int, default=0, help="of the starts")
     add("--threads", type=int, default=os.cpu_count(), help="cores to use (default: all)")
     add("--out", type=Path, default=Path("results"), help="folder of the CSV file and the picture")
     args = parser.parse_args(argv)
-    function, task, robot, seconds = EXPERIMENTS[args.experiment]
+    function, task, robot, methods = EXPERIMENTS[args.experiment]
+    seconds = 10.0 if args.experiment in ("real_world", "gaits") else 20.0
     args.robot, args.seconds = args.robot or robot, args.seconds or seconds
-    if args.methods and args.checkpoints:
-        parser.error("--methods and --checkpoints both choose policies: leave one of them away")
-    if args.episodes < 1 or args.threads < 1 or not CONTROL_DT <= args.seconds < 1e5:
-        parser.error("there is at least one episode of 0.02 s, and one thread")
+    if args.episodes < 1 or args.threads < 1 or args.seconds < CONTROL_DT:
+        parser.error(f"there is at least one episode of {CONTROL_DT} s, and one thread")
     try:
         args.task = task or first_task(args.robot)
-        robots = TASKS[args.task].robots
-        if args.robot not in robots:
-            parser.error(f"{args.experiment} is for {', '.join(robots)}, not for {args.robot}")
-        policies = find_policies(args)
+        policies = find_policies(args, methods)
         args.out.mkdir(parents=True, exist_ok=True)
         torch.set_num_threads(args.threads)
-        function(args, policies)
-        name = f"gaits-{args.robot}" if function is gaits else args.experiment
-        print(f"\nwritten: {args.out / name}.csv and .png")
-    except (CheckpointError, ValueError, OSError, FloatingPointError) as error:
+        with torch.no_grad():
+            function(args, policies)
+        print(f"\nwritten: {args.out / args.experiment}.csv and .png")
+    except (ValueError, OSError, ArithmeticError, MemoryError) as error:
         sys.exit(f"error: {error}")
 
 

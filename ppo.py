@@ -6,8 +6,7 @@ One iteration is three phases, in this order in the file:
     Learner.update  epochs of minibatches through ppo_loss, with the stored masks replayed
 
 PPO's ratio is pi_new(a|s) / pi_old(a|s). With dropout the policy that acted is pi_old(a|s, mask):
-so the mask is remembered, as s and a are. On the first minibatch of an update no weight has moved,
-and the ratio is exactly 1; with fresh masks it is not, and PPO would correct the dropout's dice.
+so the mask is remembered, as s and a are. Before a weight has moved the ratio is then exactly 1.
 
 Legend: T steps, N robots of this process, B samples of a minibatch, A actions of a robot.
 """
@@ -20,6 +19,8 @@ from torch import Tensor, nn
 from torch.distributions import Normal, kl_divergence
 
 from rolt import Masks, Observation
+
+Normal.set_default_validate_args(False)  # what is not finite is stopped in `Learner.update`
 
 
 @dataclass(frozen=True)
@@ -51,9 +52,8 @@ def proprioception(legs: Tensor) -> Tensor:
 
 
 class Critic(nn.Module):
-    """V(s), the same for all methods: an MLP [512, 256, 128] ELU (legged_gym), without dropout. It
-    is there in training only, so it sees what no policy does: what is wrong with the robot, and
-    clean heights (an asymmetric critic, Pinto et al. 2018; NOTES 10)."""
+    """V(s), the same for all methods: an MLP [512, 256, 128] ELU (legged_gym). In training only, so
+    it sees what no policy does: faults, clean heights (Pinto et al. 2018; NOTES 10)."""
 
     def __init__(self, observation: Observation):
         super().__init__()
@@ -68,11 +68,8 @@ class Critic(nn.Module):
         return self.network(self.inputs(observation)).squeeze(1)  # (B, 1) -> (B,)
 
 
-# ---------------------------------------------------------------------- collect
-
-
 class RolloutBuffer:
-    """T x N transitions, allocated once; `masks` has the dropout masks that were drawn for each."""
+    """T x N transitions, allocated once, the dropout masks of each, and the policy's std (A,)."""
 
     def __init__(self, T: int, observation: Observation, num_actions: int, masks: Masks, device):
         N = len(observation.legs)
@@ -82,7 +79,6 @@ class RolloutBuffer:
 
         self.observation = Observation(*(zeros(*field.shape[1:]) for field in observation))
         self.action, self.mean = zeros(num_actions), zeros(num_actions)
-        self.std = torch.zeros(num_actions, device=device)  # one for all states
         self.log_prob, self.value, self.next_value, self.reward = zeros(), zeros(), zeros(), zeros()
         self.terminated, self.truncated = zeros(dtype=torch.bool), zeros(dtype=torch.bool)
         self.advantage, self.returns = zeros(), zeros()
@@ -98,11 +94,6 @@ class RolloutBuffer:
         batch["masks"] = {name: mask.flatten(0, 1)[index] for name, mask in self.masks.items()}
         observation = (field.flatten(0, 1)[index] for field in self.observation)
         return batch | {"observation": Observation(*observation)}
-
-
-def gaussian(mean: Tensor, std: Tensor) -> Normal:
-    """Unchecked: `Learner.update` names what is not finite, before it reaches a weight."""
-    return Normal(mean, std, validate_args=False)
 
 
 def to_tensors(observation: Observation, device) -> Observation:
@@ -122,7 +113,7 @@ def collect(
 ) -> tuple[Observation, list[dict]]:  # fmt: skip
     """T steps of every robot into `buffer`. Returns the observation to go on from, all infos."""
     device, infos = buffer.reward.device, []
-    buffer.std.copy_(policy.std())
+    buffer.std = policy.std()
     for t in range(len(buffer.reward)):
         observation = to_tensors(observation, device)
         masks = policy.sample_masks(env.num_envs, generator)
@@ -134,13 +125,12 @@ def collect(
         for name in buffer.masks:  # the masks are part of the transition
             buffer.masks[name][t] = masks[name]
         buffer.action[t], buffer.mean[t], buffer.value[t] = action, mean, critic(observation)
-        buffer.log_prob[t] = gaussian(mean, buffer.std).log_prob(action).sum(-1)
+        buffer.log_prob[t] = Normal(mean, buffer.std).log_prob(action).sum(-1)
 
         observation, reward, terminated, truncated, info = env.step(action.cpu().numpy())
         buffer.reward[t] = torch.from_numpy(reward)
         buffer.terminated[t] = torch.from_numpy(terminated)
         buffer.truncated[t] = torch.from_numpy(truncated)
-        buffer.next_value[t] = 0
         if len(info["truncated_ids"]):  # the next one here is of another episode: ask the true one
             ids = torch.from_numpy(info["truncated_ids"]).to(device)
             buffer.next_value[t, ids] = critic(to_tensors(info["final_observation"], device))
@@ -151,18 +141,13 @@ def collect(
     return observation, infos
 
 
-# ---------------------------------------------------------------------- the mathematics
-
-
 def compute_gae(
     reward: Tensor, value: Tensor, next_value: Tensor,
     terminated: Tensor, truncated: Tensor, gamma: float, lam: float,
 ) -> Tensor:  # fmt: skip
-    """Generalised advantage estimation (Schulman et al. 2016), all (T, N) -> (T, N).
-
-    next_value[t] is V of where step t led to, before any reset. A termination has no future: V does
-    not count. A time-out has one that we stop watching: V counts, but no later advantage does.
-    """
+    """Generalised advantage estimation (Schulman et al. 2016), all (T, N). next_value[t] is V of
+    where step t led to, before any reset. A termination has no future: V does not count. A time-out
+    has one that we stop watching: V counts, but no later advantage does."""
     advantage, running = torch.zeros_like(reward), torch.zeros_like(reward[0])
     delta = reward + gamma * next_value * ~terminated - value  # the TD error
     for t in reversed(range(len(reward))):
@@ -195,51 +180,42 @@ def adapt_learning_rate(rate: float, kl: float, target: float) -> float:
     return min(1e-2, rate * 1.5) if 0 < kl < target / 2 else rate
 
 
-# ---------------------------------------------------------------------- update
-
-
-def all_reduce(tensor: Tensor) -> Tensor:
-    """Sum over all processes, in place; alone, the tensor itself."""
-    if dist.is_initialized():
-        dist.all_reduce(tensor)
-    return tensor
-
-
-def num_processes() -> int:
-    return dist.get_world_size() if dist.is_initialized() else 1
+def average(tensor: Tensor) -> Tensor:
+    """Mean over all processes, which have equally many samples; alone, the tensor itself."""
+    if not dist.is_initialized():
+        return tensor
+    dist.all_reduce(tensor)
+    return tensor / dist.get_world_size()
 
 
 class Learner:
     """Policy, critic and optimiser; a copy in each process, which has its own samples. Trains the
     parameters that require a gradient. Later stages of baselines (baselines.py) override `loss`."""
 
+    first_rate: float | None = None  # of what it trains; None = the config's
+
     def __init__(self, policy, critic: nn.Module, config: PPOConfig, bf16: bool = False):
         self.policy, self.critic, self.config, self.bf16 = policy, critic, config, bf16
-        actor = {name: p for name, p in policy.named_parameters() if p.requires_grad}
-        values = {f"critic.{name}": p for name, p in critic.named_parameters() if p.requires_grad}
-        self.parameters = actor | values
-        actor_group = {"params": list(actor.values()), "lr": config.learning_rate}
-        critic_group = {"params": list(values.values()), "lr": config.critic_learning_rate}
+        actor = [p for p in policy.parameters() if p.requires_grad]
+        values = [p for p in critic.parameters() if p.requires_grad]
+        self.parameters = actor + values
+        actor_group = {"params": actor, "lr": self.first_rate or config.learning_rate}
+        critic_group = {"params": values, "lr": config.critic_learning_rate}
         self.optimizer = torch.optim.Adam([actor_group, critic_group], fused=True)
-        self.learning_rate = config.learning_rate  # the policy's
-
-    def state_dict(self) -> dict:
-        return {"optimizer": self.optimizer.state_dict(), "learning_rate": self.learning_rate}
-
-    def load_state_dict(self, state: dict) -> None:
-        self.optimizer.load_state_dict(state["optimizer"])
-        self.learning_rate = state["learning_rate"]
 
     def update(self, buffer: RolloutBuffer, generator: torch.Generator, progress=0.0) -> dict:
         """PPO's epochs on one rollout. progress: of the training, 0 to 1. Returns the means of
-        `loss`'s figures. Raises FloatingPointError before what is not finite reaches a weight."""
+        `loss`'s figures; FloatingPointError before what is not finite reaches a weight."""
         config = self.config
-        buffer.advantage = compute_gae(
+        advantage = compute_gae(
             buffer.reward, buffer.value, buffer.next_value, buffer.terminated, buffer.truncated,
             config.discount, config.gae_lambda,
         )  # fmt: skip
-        buffer.returns = buffer.advantage + buffer.value
-        buffer.advantage = normalise(buffer.advantage)
+        buffer.returns = advantage + buffer.value
+        x = advantage.double()  # to zero mean and unit deviation over the samples of all processes
+        mean, square = average(torch.stack([x.mean(), (x**2).mean()]))
+        deviation = (square - mean**2).clamp(min=0).sqrt()
+        buffer.advantage = ((x - mean) / (deviation + 1e-8)).float()
 
         totals = {}
         size = len(buffer) // config.minibatches
@@ -249,51 +225,31 @@ class Learner:
                 loss, stats = self.loss(buffer.minibatch(index), buffer.std, progress)
                 self.optimizer.zero_grad()
                 loss.backward()
-                self._average_gradients()
-                self._clip_gradients()
+                gradients = [p.grad for p in self.parameters if p.grad is not None]
+                averaged = average(nn.utils.parameters_to_vector(gradients))  # in one message
+                nn.utils.vector_to_parameters(averaged, gradients)
+                norm = nn.utils.clip_grad_norm_(self.parameters, config.max_gradient_norm)
+                if not torch.isfinite(norm):
+                    why = "a gradient is not finite: try another seed or learning rate"
+                    raise FloatingPointError(why)
                 self.optimizer.step()
                 for name, value in stats.items():
                     totals[name] = totals.get(name, 0.0) + value.detach()
 
-        count = config.epochs * config.minibatches * num_processes()
-        means = all_reduce(torch.stack(list(totals.values()))) / count
+        means = average(torch.stack(list(totals.values()))) / (config.epochs * config.minibatches)
         stats = dict(zip(totals, means.tolist()))
+        actor = self.optimizer.param_groups[0]
         if "kl" in stats:
-            rate = adapt_learning_rate(self.learning_rate, stats["kl"], config.target_kl)
-            self.learning_rate = self.optimizer.param_groups[0]["lr"] = rate
-        return stats
+            actor["lr"] = adapt_learning_rate(actor["lr"], stats["kl"], config.target_kl)
+        return stats | {"learning_rate": actor["lr"]}
 
     def loss(self, batch: dict, old_std: Tensor, progress: float) -> tuple[Tensor, dict]:
         """The mean loss of a minibatch, and its parts. The rollout's masks are replayed."""
         mean = mean_action(self.policy, batch["observation"], batch["masks"], self.bf16)
-        old, new = gaussian(batch["mean"], old_std), gaussian(mean, self.policy.std())
+        old, new = Normal(batch["mean"], old_std), Normal(mean, self.policy.std())
         loss, stats = ppo_loss(
             new.log_prob(batch["action"]).sum(-1), batch["log_prob"], batch["advantage"],
             self.critic(batch["observation"]), batch["value"], batch["returns"],
             new.entropy().sum(-1), (1 - progress) * self.config.entropy_weight, self.config,
         )  # fmt: skip
         return loss, stats | {"kl": kl_divergence(old, new).sum(-1).mean()}
-
-    def _average_gradients(self) -> None:
-        """Over all processes, in one message."""
-        if dist.is_initialized():
-            gradients = [p.grad for p in self.parameters.values()]
-            flat = all_reduce(torch.cat([g.flatten() for g in gradients])) / num_processes()
-            for g, part in zip(gradients, flat.split([g.numel() for g in gradients])):
-                g.copy_(part.view_as(g))
-
-    def _clip_gradients(self) -> None:
-        norm = nn.utils.clip_grad_norm_(self.parameters.values(), self.config.max_gradient_norm)
-        if not torch.isfinite(norm):
-            bad = [n for n, p in self.parameters.items() if not torch.isfinite(p.grad).all()]
-            name = bad[0] if bad else "the loss"
-            raise FloatingPointError(f"training has diverged: the gradient of {name} is not finite")
-
-
-def normalise(advantage: Tensor) -> Tensor:
-    """Zero mean and unit deviation over the samples of all processes."""
-    x = advantage.double()
-    sums = torch.stack([torch.full_like(x, 1.0).sum(), x.sum(), (x**2).sum()])
-    count, total, squares = all_reduce(sums)
-    mean = total / count
-    return ((x - mean) / ((squares / count - mean**2).clamp(min=0).sqrt() + 1e-8)).float()

@@ -1,9 +1,8 @@
-"""The nine rewards of the paper's Table I, each a function of the env's state.
+"""The nine rewards of the paper's Table I: functions of the env (attributes: env.py) -> (N,).
 
-Every function takes the env (see the attribute table in env.py) and returns (N,), a number a
-robot. The weights are the paper's; what the table leaves open is legged_gym's, which the paper
-trained with. As there, the weighted sum is multiplied by the control period and floored at zero, so
-that early on, when all goes wrong, falling at once is never better than trying.
+Weights are the paper's; what the table leaves open is legged_gym's, which the paper trained with.
+As there, the weighted sum is multiplied by the control period and floored at zero: early on, when
+all goes wrong, falling at once is never better than trying.
 """
 
 import numpy as np
@@ -11,6 +10,7 @@ import numpy as np
 TRACKING_SIGMA = 0.25  # (m/s)^2 and (rad/s)^2, legged_gym; the paper names sigma without a value
 AIR_TIME_TARGET = 0.5  # s, legged_gym
 MOVING_COMMAND = 0.1  # m/s, legged_gym: one told to stand still is not paid for lifting its feet
+FALL = -1.0  # ours, for a fall, once, after the floor: lunging must not pay (NOTES 8)
 
 
 def xy_velocity_tracking(env) -> np.ndarray:
@@ -60,8 +60,7 @@ def joint_error(env) -> np.ndarray:
     return np.sum(env.joint_error**2, axis=(1, 2))
 
 
-# Weight of each term (paper, Table I).
-REWARDS = {
+REWARDS = {  # weight of each term (paper, Table I)
     xy_velocity_tracking: 1.5,
     yaw_velocity_tracking: 0.5,
     z_velocity: -2.0,
@@ -72,8 +71,6 @@ REWARDS = {
     foot_air_time: 1.0,
     joint_error: -0.04,
 }
-
-FALL = -1.0  # ours, for a fall, once, after the floor: lunging must not pay (NOTES 8)
 
 
 def total_reward(env, dt: float) -> tuple[np.ndarray, dict[str, np.ndarray]]:

@@ -1,21 +1,20 @@
 """Robots as data, and the one function that turns a robot into a MuJoCo model.
 
-A robot is a trunk and L equal legs of J joints. A new robot is a `Robot(...)` at the end of this
-file and an entry in `ROBOTS`. Only the front right leg is written down: left legs are its mirror
-image in y, rear legs in x where `Link.rear_mirrors_x` says so. Legs are called FR, FL, RR, RL
-(front or rear, right or left), their joints hip, thigh, calf.
+A robot is a trunk and L equal legs of J joints, of which the front right one is written down: left
+legs are its mirror image in y, rear legs in x where `Link.rear_mirrors_x` says so. Legs are called
+FR, FL, RR, RL (front or rear; the hexapod's front, middle, hind), their joints hip, thigh, calf. A
+new robot is a `Robot(...)` at the end of this file and an entry in `ROBOTS`.
 
 What a fault (faults.py) changes on one robot is prepared here, so that a fault is only numbers:
 
     joint lock      an inactive equality constraint a joint  eq_active
     motor strength  a position actuator a joint              actuator_gainprm, _biasprm, _forcerange
-    friction        its geoms decide it (priority 1)         geom_friction
     half-lock       a joint's stops                          jnt_range
     box to tow      a box on a tether, slack without end     tendon_range      only if asked for
     skate           a foot that is a wheel, its brake on     dof_frictionloss  only if asked for
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import mujoco
 import numpy as np
@@ -23,13 +22,33 @@ import numpy as np
 from terrain import Terrain
 
 PHYSICS_DT = 0.005  # s, legged_gym: 200 Hz physics, 4 substeps a control step of 50 Hz
+# implicitfast takes kd implicitly. Newton needs 2 or 3 iterations; bounded, none stalls others.
+WORLD = f"""
+<mujoco>
+  <compiler angle="radian"/>
+  <option timestep="{PHYSICS_DT}" integrator="implicitfast" iterations="10" ls_iterations="20"/>
+  <visual>
+    <global offwidth="1280" offheight="720"/>
+    <headlight ambient="0.4 0.4 0.4" diffuse="0.2 0.2 0.2"/>
+  </visual>
+  <asset>
+    <texture type="skybox" builtin="gradient" rgb1="1 1 1" rgb2="0.7 0.8 0.9" width="128"/>
+    <texture name="checker" type="2d" builtin="checker" rgb1="0.88 0.89 0.91" rgb2="0.78 0.81 0.84"
+             width="256" height="256"/>
+    <material name="ground" texture="checker" texrepeat="2 2" texuniform="true"/>
+  </asset>
+  <worldbody>
+    <geom name="ground" type="plane" size="0 0 0.05" material="ground" conaffinity="0"/>
+  </worldbody>
+</mujoco>
+"""
 
 # The props of the real-world test. The paper gives no numbers: all ours.
 BOX_MASS = 4.0  # kg, a third of a Go1
 BOX_FRICTION = 0.5  # cardboard on a floor: 20 N to drag it, a sixth of a Go1's weight, on one leg
 BOX_SIZE = (0.3, 0.3, 0.2)  # m
 BOX_START = (-0.95, 0.0, 0.1)  # m, behind the robot
-TETHER = 0.8  # m, of the hindmost legs: slack at first
+TETHER = 0.8  # m, of the hindmost legs; further forward, longer by as much: all slack at first
 SLACK = 1000.0  # m, the length of a tether that nobody has tied
 WHEEL_MASS = 0.1  # kg
 BRAKE = 10.0  # N m, dry friction of a braked wheel; at 0.02 m four times a robot's weight
@@ -38,7 +57,7 @@ Names = tuple[str, ...]
 Vec3 = tuple[float, float, float]
 Inertia = tuple[float, float, float, float, float, float]  # Ixx, Iyy, Izz, Ixy, Ixz, Iyz
 X, Y, Z = (1, 0, 0), (0, 1, 0), (0, 0, 1)
-_TOUCH = {"contype": 0, "conaffinity": 1, "condim": 3, "priority": 1}  # the ground alone
+_TOUCH = {"contype": 0, "priority": 1}  # the ground alone
 
 
 @dataclass(frozen=True)
@@ -50,22 +69,11 @@ class Link:
     com: Vec3  # m, centre of mass in the link's frame
     inertia: Inertia  # kg m^2 about the centre of mass, link axes
     offset: Vec3  # m, joint origin in the parent link's frame (the first link's: `Robot.mounts`)
-    axis: Vec3  # of left legs too: mirrored, a turn about x or z is then a turn the other way
+    axis: Vec3  # along x, y or z; a left leg turns the other way about x and z
     limits: tuple[float, float]  # rad, right legs
     effort: float  # N m, torque limit
     capsule: tuple[float, Vec3, Vec3] | None  # collision shape: radius, start, end, m, link frame
     rear_mirrors_x: bool = False  # rear legs mirror this link in x as well
-
-    def __post_init__(self):
-        if sorted(map(abs, self.axis)) != [0, 0, 1]:
-            raise ValueError(f"{self.name}: only axes along x, y or z can be mirrored to the left")
-        if self.rear_mirrors_x and not self.axis[0] and self.limits[0] != -self.limits[1]:
-            raise ValueError(f"the stops of the {self.name} would have to be mirrored: not built")
-
-    def stops(self, left: bool) -> tuple[float, float]:
-        """rad, on a left or a right leg."""
-        low, high = self.limits
-        return (-high, -low) if left and not self.axis[1] else (low, high)
 
 
 @dataclass(frozen=True)
@@ -91,20 +99,8 @@ class Robot:
     friction_loss: float  # N m, dry friction of a joint
 
     def __post_init__(self):
-        me, links = self.name, [link.name for link in self.links]
-        own = "has a name of its own"
-        if not len(set(self.legs)) == len(self.legs) == len(self.mounts) == len(self.default_pose):
-            raise ValueError(f"{me}: every leg {own}, a mount and a default pose")
         if self.mounts[0][1] >= 0:  # without leg tokens, the trunk is observed in this leg's frame
-            raise ValueError(f"{me}: the first leg must be a right one, its mount at y < 0")
-        for leg, mount, pose in zip(self.legs, self.mounts, self.default_pose):
-            if not len(set(links)) == len(links) == len(pose):
-                raise ValueError(f"{me}: every link {own}, and an angle in the pose of {leg}")
-            for link, angle in zip(self.links, pose):
-                low, high = link.stops(left=mount[1] > 0)
-                if not low < angle < high:
-                    joint = f"{leg}_{link.name} at {angle} rad"
-                    raise ValueError(f"{me}: {joint} is beyond its stops, {low} and {high}")
+            raise ValueError(f"{self.name}: the first leg must be a right one, its mount at y < 0")
 
     @property
     def joints(self) -> list[str]:
@@ -115,26 +111,20 @@ class Robot:
 def build_model(
     robot: Robot, terrain: Terrain | None = None, towing: Names = (), skating: Names = ()
 ) -> mujoco.MjModel:
-    """The robot on flat ground or on a terrain; keyframe 0 is the default pose. Bodies and
-    actuators are in the order of `robot.joints`. Contacts are robot-ground only; the sensors
-    `contact_<geom>` count those of the trunk, of each link with a capsule, and of each foot.
+    """Keyframe 0 is the default pose; bodies and actuators are in the order of `robot.joints`. The
+    sensors `contact_<geom>` count contacts, which are with the ground alone: the trunk's, then leg
+    by leg those of each link with a capsule and of the foot.
 
-    towing, skating: legs whose foot gets a tether to one box, or becomes a wheel. Both add bodies
-    and joints (find a robot's own by name), and are slack or braked until faults.py changes it.
+    towing, skating: legs whose foot gets a tether to one box, or becomes a wheel; slack or braked
+    until faults.py changes it. Both add bodies and joints: find a robot's own by name.
     """
     if unknown := {*towing, *skating} - set(robot.legs):
         raise ValueError(f"no leg {', '.join(sorted(unknown))}: the {robot.name} has {robot.legs}")
     if terrain is not None and towing:
         raise ValueError("the box wants flat ground: no terrain for robots that tow")
 
-    spec = mujoco.MjSpec()
-    spec.modelname, spec.compiler.degree = robot.name, False
-    spec.option.timestep, spec.option.cone = PHYSICS_DT, mujoco.mjtCone.mjCONE_PYRAMIDAL
-    spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST  # takes kd implicitly
-    spec.option.ls_iterations = 20
-    spec.option.iterations = 10  # Newton needs 2 or 3; the bound: one odd robot stalls no others
-
-    _add_world(spec)
+    spec = mujoco.MjSpec.from_string(WORLD)
+    spec.modelname = robot.name
     if terrain is not None:
         terrain.build(spec)
     trunk = spec.worldbody.add_body(name="trunk", pos=[0, 0, robot.start_height])
@@ -146,15 +136,17 @@ def build_model(
     _add_geom(spec, trunk, "trunk", mujoco.mjtGeom.mjGEOM_BOX, np.array(robot.trunk_box) / 2)
 
     qpos = [0, 0, robot.start_height, 1, 0, 0, 0]
-    for leg, mount, pose in zip(robot.legs, robot.mounts, robot.default_pose):
+    for leg, mount, pose in zip(robot.legs, robot.mounts, robot.default_pose, strict=True):
         body, left, rear = trunk, mount[1] > 0, mount[0] < 0
         qpos += pose
-        for link, angle in zip(robot.links, pose):
+        for link, angle in zip(robot.links, pose, strict=True):
             mirror = np.array([-1 if rear and link.rear_mirrors_x else 1, -1 if left else 1, 1])
             name = f"{leg}_{link.name}"
             body = body.add_body(name=name, pos=mount if body is trunk else mirror * link.offset)
             _set_inertia(body, link.mass, link.com, link.inertia, mirror)
-            joint = body.add_joint(name=name, axis=link.axis, range=link.stops(left))
+            turned = left and not link.axis[1]  # about x or z: the other way round
+            stops = np.negative(link.limits[::-1]) if turned else link.limits
+            joint = body.add_joint(name=name, axis=link.axis, range=stops)
             joint.armature, joint.frictionloss = robot.armature, robot.friction_loss
             if link.capsule is not None:
                 radius, start, end = link.capsule
@@ -170,13 +162,14 @@ def build_model(
             lock.solref = [2 * PHYSICS_DT, 1]  # as stiff as the time step allows: within 0.01 rad
             lock.solimp = [0.99, 0.9999, 0.001, 0.5, 2]
 
-        foot, size = mirror * robot.foot_position, [robot.foot_radius, 0, 0]
+        foot = mirror * robot.foot_position
+        ball = {"size": [robot.foot_radius, 0, 0], "mass": WHEEL_MASS}  # calves have given ones
         if leg in towing:
             body.add_site(name=f"{leg}_ankle", pos=foot)
         if leg in skating:
-            body, foot = _add_wheel(body, leg, foot, robot.foot_radius), np.zeros(3)
+            body, foot = _add_wheel(body, leg, foot), np.zeros(3)
             qpos.append(0.0)
-        _add_geom(spec, body, f"{leg}_foot", mujoco.mjtGeom.mjGEOM_SPHERE, size, pos=foot)
+        _add_geom(spec, body, f"{leg}_foot", mujoco.mjtGeom.mjGEOM_SPHERE, **ball, pos=foot)
 
     if towing:
         _add_box(spec, towing)
@@ -185,47 +178,20 @@ def build_model(
     return spec.compile()
 
 
-def tether_length(robot: Robot, leg: str) -> float:
-    """m; longer by as much as a leg is further forward, or it would be taut at the start."""
-    forward = [mount[0] for mount in robot.mounts]
-    return TETHER + forward[robot.legs.index(leg)] - min(forward)
-
-
-def _add_world(spec: mujoco.MjSpec) -> None:
-    """Ground, and light, sky and colours for pictures."""
-    spec.visual.global_.offwidth, spec.visual.global_.offheight = 1280, 720
-    spec.visual.headlight.ambient, spec.visual.headlight.diffuse = [0.4] * 3, [0.2] * 3
-    texture, builtin = mujoco.mjtTexture, mujoco.mjtBuiltin
-    sky = spec.add_texture(name="sky", width=128, height=128 * 6)
-    sky.type, sky.builtin = texture.mjTEXTURE_SKYBOX, builtin.mjBUILTIN_GRADIENT
-    sky.rgb1, sky.rgb2 = [1, 1, 1], [0.7, 0.8, 0.9]
-    checker = spec.add_texture(name="checker", width=256, height=256)
-    checker.type, checker.builtin = texture.mjTEXTURE_2D, builtin.mjBUILTIN_CHECKER
-    checker.rgb1, checker.rgb2 = [0.88, 0.89, 0.91], [0.78, 0.81, 0.84]
-    material = spec.add_material(name="ground", texrepeat=[2, 2], texuniform=True)  # 0.25 m each
-    material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "checker"
-    plane = {"type": mujoco.mjtGeom.mjGEOM_PLANE, "size": [0, 0, 0.05], "material": "ground"}
-    spec.worldbody.add_geom(name="ground", contype=1, conaffinity=0, **plane)
-
-
 def _add_geom(spec: mujoco.MjSpec, body, name: str, kind, size, **where) -> None:
     """With a sensor that counts its contacts."""
     geom = body.add_geom(name=name, type=kind, size=size, **_TOUCH, **where)
     foot = kind == mujoco.mjtGeom.mjGEOM_SPHERE
     geom.rgba = [0.15, 0.15, 0.17, 1] if foot else [0.35, 0.45, 0.60, 1]
-    geom.friction = [1, 0.005, 0.0001]
     contact = {"type": mujoco.mjtSensor.mjSENS_CONTACT, "objtype": mujoco.mjtObj.mjOBJ_GEOM}
     intprm = [1 << mujoco.mjtConDataField.mjCONDATA_FOUND.value, 0, 1]  # fields, reduction, slots
     spec.add_sensor(name=f"contact_{name}", objname=name, intprm=intprm, **contact)
 
 
-def _add_wheel(body, leg: str, foot, radius: float):
+def _add_wheel(body, leg: str, foot):
     """A wheel in the foot's place, its axle across the leg: it rolls as the foot points and grips
-    sideways (without friction it would be ice). Not two numbers of friction: MuJoCo's belong to the
-    contact's frame, which does not turn with the foot."""
+    sideways. Two numbers of friction would not do: MuJoCo's axes do not turn with the foot."""
     wheel = body.add_body(name=f"{leg}_wheel", pos=foot)
-    moment = 0.4 * WHEEL_MASS * radius**2  # a solid ball
-    _set_inertia(wheel, WHEEL_MASS, (0, 0, 0), (moment, moment, moment, 0, 0, 0))
     joint = wheel.add_joint(name=f"{leg}_wheel", axis=Y, frictionloss=BRAKE)
     joint.armature = 1e-4  # a rim of 0.25 kg: a lighter wheel runs away when a robot flails
     joint.solref_friction = [2 * PHYSICS_DT, 1]  # this and the next, or else the brake creeps
@@ -239,7 +205,7 @@ def _add_box(spec: mujoco.MjSpec, legs: Names) -> None:
     box.add_freejoint(name="box")
     geom = box.add_geom(name="box", size=np.array(BOX_SIZE) / 2, mass=BOX_MASS, **_TOUCH)
     geom.type, geom.rgba = mujoco.mjtGeom.mjGEOM_BOX, [0.76, 0.60, 0.42, 1]
-    geom.friction = [BOX_FRICTION, 0.005, 0.0001]
+    geom.friction[0] = BOX_FRICTION
     box.add_site(name="box_front", pos=[BOX_SIZE[0] / 2, 0, 0])
     for leg in legs:
         tether = spec.add_tendon(name=f"{leg}_tether", limited=True, range=[-1, SLACK])
@@ -256,9 +222,8 @@ def _set_inertia(body, mass: float, com, inertia, mirror=(1, 1, 1)) -> None:
 
 
 # Unitree A1, 12.45 kg. Sources: mujoco_menagerie unitree_a1/a1.xml (masses, inertias, limits,
-# armature, friction), Unitree's a1.urdf (trunk box), legged_gym a1_config.py (pose, gains, action
-# scale, start height). Thigh and calf boxes are capsules here: as exact on steps and quicker. The
-# hips, inside the trunk's outline, do not collide.
+# armature, friction), a1.urdf (trunk box), legged_gym a1_config.py (pose, gains, action scale,
+# start height). Boxes are capsules: as exact on steps, quicker. Hips, in the trunk, do not collide.
 A1 = Robot(
     name="a1", legs=("FR", "FL", "RR", "RL"),
     trunk_mass=4.713, trunk_com=(0, 0.0041, -0.0005), trunk_box=(0.267, 0.194, 0.114),
@@ -280,11 +245,10 @@ A1 = Robot(
     stiffness=20.0, damping=0.5, action_scale=0.25, armature=0.01, friction_loss=0.2,
 )  # fmt: skip
 
-# Unitree Go1, 12.74 kg. Sources: mujoco_menagerie unitree_go1/go1.xml (masses, inertias, limits,
-# armature, friction), Unitree's go1.urdf (trunk box), legged_gym a1_config.py (pose, gains, action
-# scale: a like machine). Start height ours: legs that start stretched must not be in the ground.
-GO1 = Robot(
-    name="go1", legs=("FR", "FL", "RR", "RL"),
+# Unitree Go1, 12.74 kg. Sources likewise: unitree_go1/go1.xml, go1.urdf, a1_config.py (a like
+# machine). Start height ours: legs that start stretched must not be in the ground.
+GO1 = replace(
+    A1, name="go1",
     trunk_mass=5.204, trunk_com=(0.0223, 0.002, -0.0005), trunk_box=(0.3762, 0.0935, 0.114),
     trunk_inertia=(0.0168128, 0.0630095, 0.0716547, -2.3e-4, -2.95e-4, -4.2e-5),
     mounts=((0.1881, -0.04675, 0), (0.1881, 0.04675, 0),
@@ -301,8 +265,6 @@ GO1 = Robot(
              axis=Y, limits=(-2.818, -0.888), capsule=(0.01, (0, 0, 0), (0, 0, -0.19))),
     ),
     foot_position=(0, 0, -0.213), foot_radius=0.023, start_height=0.45,
-    default_pose=((-0.1, 0.8, -1.5), (0.1, 0.8, -1.5), (-0.1, 1.0, -1.5), (0.1, 1.0, -1.5)),
-    stiffness=20.0, damping=0.5, action_scale=0.25, armature=0.01, friction_loss=0.2,
 )  # fmt: skip
 
 # ElSpider Air, 30.5 kg: the hexapod of the authors' laboratory (the paper names none). Sources:

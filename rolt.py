@@ -3,7 +3,8 @@
 Where each equation is:
     eq. 1  e^l = MLP(s^l)             `leg_embedding`, one network for all legs
     eq. 2  e^a = W a_{t-1} + b        `action_embedding`, by it a leg finds out which one it is
-    eq. 3  e^prop = [e^l..., e^a]     `tokens`, followed by the 12 patches e^h = linear(s^h) + p_e
+    eq. 3  e^prop = [e^l..., e^a]     `tokens`, followed where the policy reads the scan by the 12
+           patches e^h = linear(s^h) + p_e
     III-B  two encoder layers, linear decoder on the leg tokens     `EncoderLayer`, `forward`
     III-C  feature dropout, position embedding (PE) dropout         `sample_masks`, `drop`, `tokens`
 
@@ -27,8 +28,12 @@ import torch
 from torch import Tensor, nn
 
 HISTORY = 10  # H, steps (paper, section III-A)
+SCAN_SHAPE = (16, 12)  # points forward, left
+PATCH = 4  # points a side, ours
+GRID = (SCAN_SHAPE[0] // PATCH, SCAN_SHAPE[1] // PATCH)
+NUM_PATCHES = GRID[0] * GRID[1]  # P = 12, paper
 LOG_STD_BOUNDS = (math.log(0.05), math.log(2.0))  # ours
-Masks = dict[str, Tensor]  # what the policy drew in the rollout: name -> (B, ...) bool, True = keep
+Masks = dict[str, Tensor]  # what a policy drew in the rollout: (B, ...) bool, True = keep; or noise
 
 
 class Observation(NamedTuple):
@@ -36,7 +41,7 @@ class Observation(NamedTuple):
 
     legs: Tensor  # (B, L, H, 3J + 12)
     action: Tensor  # (B, L*J)
-    privileged: Tensor  # (B, 2*L*J + 1), or (B, 0) as all that follows
+    privileged: Tensor  # (B, 2*L*J + 1 + M), or (B, 0) as all that follows
     heights: Tensor  # (B, 16, 12)
     past: Tensor  # (B, L, 50, 3J + 12)
     situation: Tensor  # (B, 1)
@@ -51,8 +56,6 @@ class ROLTConfig:
     heads: int = 4  # ours: the paper names no number; 4 heads of 40
     feedforward: int = 320  # ours: twice the width keeps it light
     scan: bool = False  # reads heights? Flat ground's are 192 times one number (NOTES 12)
-    scan_shape: tuple[int, int] = (16, 12)  # points forward, left
-    patch: int = 4  # points a side: 12 patches, as in the paper
     initial_std: float = 1.0  # legged_gym; from 0.7 the robots learn to stand first (NOTES 4)
     patch_position_std: float = 0.75  # ours: as large as what it is added to (NOTES 3)
     leg_position_std: float = 0.2  # ours, likewise
@@ -62,12 +65,6 @@ class ROLTConfig:
     # leg (its ablation Module PE), or "none" (our control No Identity)
     identity: str = "action"
     leg_frames: bool = True  # sees and acts in leg frames (env.py); False = our No Leg Frames
-
-    @property
-    def num_patches(self) -> int:
-        """P"""
-        rows, columns = self.scan_shape
-        return rows // self.patch * (columns // self.patch) if self.scan else 0
 
 
 def draw_mask(shape: tuple[int, ...], p: float, generator: torch.Generator) -> Tensor:
@@ -100,7 +97,6 @@ class EncoderLayer(nn.Module):
     def __init__(self, config: ROLTConfig):
         super().__init__()
         D, hidden = config.width, config.feedforward
-        assert D % config.heads == 0, "the width must be a multiple of the number of heads"
         self.heads, self.p = config.heads, config.feature_dropout
         self.norm_attention, self.norm_feedforward = nn.LayerNorm(D), nn.LayerNorm(D)
         self.query, self.key_value = nn.Linear(D, D), nn.Linear(D, 2 * D)
@@ -112,8 +108,7 @@ class EncoderLayer(nn.Module):
 
         To leave out those that nobody reads afterwards changes nothing in the rest: what a token
         becomes depends on the other tokens' keys and values, never on their queries.
-        Returns: tokens (B, queries, D), attention weights (B, heads, queries, T).
-        """
+        Returns: tokens (B, queries, D), attention weights (B, heads, queries, T)."""
         normed = self.norm_attention(x)
         x = x[:, :queries]
         q = self._split(self.query(normed[:, :queries]))  # (B, heads, queries, d)
@@ -134,7 +129,7 @@ class EncoderLayer(nn.Module):
 class ROLT(nn.Module):
     """Gaussian policy: each action's mean from the transformer, a learned std a kind of joint."""
 
-    replays_masks = True  # in the update: what train.py and evaluate.py ask a policy
+    replays_masks = True  # in the update, train.py asks (Roll-Drop does not)
 
     def __init__(self, num_legs: int, num_joints: int, config: ROLTConfig = ROLTConfig()):
         super().__init__()
@@ -150,9 +145,9 @@ class ROLT(nn.Module):
         if config.identity == "action":
             self.action_embedding = nn.Linear(num_legs * num_joints, D)
         if config.scan:
-            P, std = config.num_patches, config.patch_position_std
-            self.patch_embedding = nn.Linear(config.patch**2, D)
-            self.patch_position = nn.Parameter(std * torch.randn(P, D))  # p_e
+            std = config.patch_position_std
+            self.patch_embedding = nn.Linear(PATCH**2, D)
+            self.patch_position = nn.Parameter(std * torch.randn(NUM_PATCHES, D))  # p_e
             if config.pe_dropout > 0:  # stands in for every dropped p_e
                 self.dropped_position = nn.Parameter(std * torch.randn(D))
 
@@ -170,8 +165,7 @@ class ROLT(nn.Module):
         """For n samples: (n, P) patches that keep their p_e, (n, tokens, D) features that stay."""
         config, masks = self.config, {}
         if config.scan and config.pe_dropout > 0:
-            shape = (n, config.num_patches)
-            masks["patch_position"] = draw_mask(shape, config.pe_dropout, generator)
+            masks["patch_position"] = draw_mask((n, NUM_PATCHES), config.pe_dropout, generator)
         if config.feature_dropout > 0:
             for i in range(config.layers):
                 shape = (n, self._queries(i), config.width)
@@ -199,8 +193,7 @@ class ROLT(nn.Module):
 
         if config.scan:
             # s = patch: (B, 4s, 3s) -> (B, 4, s, 3, s) -> (B, 4, 3, s, s) -> (B, P, s*s)
-            rows, columns = (size // config.patch for size in config.scan_shape)
-            squares = observation.heights.unflatten(2, (columns, -1)).unflatten(1, (rows, -1))
+            squares = observation.heights.unflatten(2, (GRID[1], -1)).unflatten(1, (GRID[0], -1))
             patches = self.patch_embedding(squares.transpose(2, 3).flatten(3).flatten(1, 2))
             position = self.patch_position
             if "patch_position" in masks:
@@ -213,7 +206,7 @@ class ROLT(nn.Module):
         """How many tokens a layer updates: those read afterwards; after the last, only the legs."""
         if layer == self.config.layers - 1:
             return self.num_legs
-        return self.num_legs + (self.config.identity == "action") + self.config.num_patches
+        return self.num_legs + (self.config.identity == "action") + NUM_PATCHES * self.config.scan
 
     def _encode(self, observation, masks: Masks) -> tuple[Tensor, list[Tensor]]:
         """The leg tokens after the last layer (B, L, D), and every layer's attention weights."""

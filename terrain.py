@@ -1,13 +1,12 @@
 """Terrain: a map of tiles, as solids that MuJoCo collides and as the exact height of the ground.
 
 A map has rows of levels, one behind the other along x, and columns of kinds, side by side along y.
-A tile is 8 m square with a flat strip around it; robots start on the strip before it and walk on
-along x, up and down again. It is flat, a slope (a frustum: up to 2 m inwards, then level), stairs
-(a pyramid of 6 steps) or platforms (5 x 5 blocks of random height). All coordinates in metres.
+A tile is 8 m square with a flat strip around it; robots start on the strip before it and walk along
+x. It is flat, a slope (a frustum: up to 2 m inwards, then level), stairs (a pyramid of 6 steps) or
+platforms (5 x 5 blocks of random height). All coordinates in metres.
 
-Heights grow with the level: legged_gym's formulas, for its levels 0 to 9; 10 is ours, as -2 and -1,
-for a policy that comes from flat ground and hardly lifts its feet. Solids are boxes and
-meshes: legged_gym's height field is four times as slow, and its steps are never quite vertical.
+Levels 0 to 9 are legged_gym's; 10 is ours, as -2 and -1, for a policy from flat ground that hardly
+lifts its feet. legged_gym's height field is four times as slow, its steps never quite vertical.
 """
 
 from dataclasses import dataclass
@@ -32,16 +31,6 @@ def rise(level: int) -> float:
     return 0.05 + 0.018 * level
 
 
-def slope(level: int) -> float:
-    """Height over run of a slope, legged_gym."""
-    return 0.04 * max(0, level)
-
-
-def block_height(level: int) -> float:
-    """m, the highest platform, legged_gym."""
-    return 0.05 + 0.02 * level
-
-
 @dataclass(frozen=True)
 class Terrain:
     """Tile (row, column): x from 8 row to 8 row + 8, y from 8 column - 4 to 8 column + 4."""
@@ -52,24 +41,22 @@ class Terrain:
     def __post_init__(self):
         if unknown := ", ".join(sorted(set(self.columns) - set(KINDS))):
             raise ValueError(f"unknown kind of terrain {unknown}; there is {', '.join(KINDS)}")
-        if not self.columns or not self.levels or not all(-2 <= n <= 10 for n in self.levels):
-            raise ValueError(f"a terrain has columns, and rows of level -2 to 10, not {self}")
 
-    def _table(self, kind: str, size) -> np.ndarray:
-        """(rows, columns), `size` of the level where the tile is of this kind, 0 elsewhere."""
-        sizes = np.array([size(level) for level in self.levels])
-        return sizes[:, None] * [kind == other for other in self.columns]
+    @cached_property
+    def sizes(self) -> dict[str, np.ndarray]:
+        """{kind: (rows, columns)}, legged_gym's; 0 where a tile is of another kind."""
+        level, columns = np.array(self.levels), np.array(self.columns)
+        sizes = {"stairs": rise(level)}  # m, of a step
+        sizes["slope"] = 0.04 * np.maximum(0, level)  # height over run
+        sizes["platforms"] = 0.05 + 0.02 * level  # m, the highest
+        return {kind: np.outer(size, columns == kind) for kind, size in sizes.items()}
 
     @cached_property
     def blocks(self) -> np.ndarray:
         """(rows, columns, 5, 5), platforms: each low, half or full (legged_gym also digs holes)."""
         shape = (len(self.levels), len(self.columns), BLOCKS, BLOCKS)
         draws = np.random.default_rng(0).integers(3, size=shape)
-        return self._table("platforms", block_height)[:, :, None, None] * draws / 2
-
-    def start(self, row: np.ndarray, column: np.ndarray) -> np.ndarray:
-        """(..., 2), where a robot starts to walk over the tile: amid the strip before it."""
-        return TILE * np.stack([row, column], axis=-1)
+        return self.sizes["platforms"][:, :, None, None] * draws / 2
 
     def height(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
         """Of the ground at (x, y), any shape."""
@@ -81,12 +68,10 @@ class Terrain:
         row, column = np.where(on, row, 0).astype(int), np.where(on, column, 0).astype(int)
 
         steps = np.minimum(np.floor(inside / TREAD) + 1, STEPS)
-        height = self._table("stairs", rise)[row, column] * steps
-        height += self._table("slope", slope)[row, column] * np.minimum(inside, SLOPE_RUN)
-        if "platforms" in self.columns:
-            i, j = (np.clip((w + HALF) / BLOCK, 0, BLOCKS - 1).astype(int) for w in (u, v))
-            height += self.blocks[row, column, i, j]
-        return np.where(on, height, 0.0)
+        height = self.sizes["stairs"][row, column] * steps
+        height += self.sizes["slope"][row, column] * np.minimum(inside, SLOPE_RUN)
+        i, j = (np.clip((w + HALF) / BLOCK, 0, BLOCKS - 1).astype(int) for w in (u, v))
+        return np.where(on, height + self.blocks[row, column, i, j], 0.0)
 
     def build(self, spec: mujoco.MjSpec) -> None:
         """Adds the solids to the world of `spec`."""
@@ -97,7 +82,7 @@ class Terrain:
                     for i in range(STEPS):
                         _add_box(spec, x, y, HALF - TREAD * i, rise(level) * (i + 1), shade=i % 2)
                 elif kind == "slope" and level > 0:
-                    _add_frustum(spec, x, y, SLOPE_RUN * slope(level), f"slope_{row}_{column}")
+                    _add_frustum(spec, x, y, self.sizes[kind][row, column], f"slope_{row}_{column}")
                 elif kind == "platforms":
                     centres = BLOCK * (np.arange(BLOCKS) + 0.5) - HALF
                     for (i, j), top in np.ndenumerate(self.blocks[row, column]):
@@ -116,20 +101,19 @@ class Terrain:
 # Two fifths of the robots learn on stairs, where the tests are. Steps of 1.4 to 12.2 cm for a robot
 # that stands 30 cm high; a run that began at level 0 (5 cm) learned to stand in front of them.
 TRAINING_MAP = Terrain(("stairs", "slope", "stairs", "platforms", "flat"), tuple(range(-2, 5)))
-_SOLID = {"contype": 1, "conaffinity": 0}  # collides with robots, as the ground does
 _SHADES = [0.80, 0.77, 0.72, 1], [0.55, 0.53, 0.50, 1]  # one step from the next
 
 
 def _add_box(spec: mujoco.MjSpec, x: float, y: float, half: float, top: float, shade=0) -> None:
     """A square box on the ground."""
     box = {"type": mujoco.mjtGeom.mjGEOM_BOX, "size": [half, half, top / 2], "pos": [x, y, top / 2]}
-    spec.worldbody.add_geom(**box, **_SOLID, rgba=_SHADES[shade])
+    spec.worldbody.add_geom(**box, conaffinity=0, rgba=_SHADES[shade])  # 0: as the ground's
 
 
-def _add_frustum(spec: mujoco.MjSpec, x: float, y: float, top: float, name: str) -> None:
+def _add_frustum(spec: mujoco.MjSpec, x: float, y: float, slope: float, name: str) -> None:
     """A square pyramid without its tip, on the ground."""
     square = np.array([(-1, -1, 0), (-1, 1, 0), (1, -1, 0), (1, 1, 0)])
-    base, platform = HALF * square, (HALF - SLOPE_RUN) * square + [0, 0, top]
+    base, platform = HALF * square, (HALF - SLOPE_RUN) * square + [0, 0, SLOPE_RUN * slope]
     spec.add_mesh(name=name, uservert=np.ravel([base, platform]))
     mesh = {"type": mujoco.mjtGeom.mjGEOM_MESH, "meshname": name, "pos": [x, y, 0]}
-    spec.worldbody.add_geom(**mesh, **_SOLID, rgba=_SHADES[0])
+    spec.worldbody.add_geom(**mesh, conaffinity=0, rgba=_SHADES[0])

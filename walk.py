@@ -1,4 +1,4 @@
-"""One walk of a policy, what is measured of it, and tables over cases and seeds.
+"""One walk of a policy, what is measured of it, and what several seeds say together.
 
 Robots go straight on and unpushed; starts vary as in training. N robots, T steps of 20 ms, L legs.
 """
@@ -12,7 +12,6 @@ import numpy as np
 import torch
 
 from env import CONTROL_DT, EnvConfig, LocomotionEnv
-from faults import Fault
 from ppo import to_tensors
 
 WARM_UP = 2.0  # s after the start that do not count for a gait; ours: by then the robot walks
@@ -31,27 +30,23 @@ class Walk(NamedTuple):
     """What N robots did. What follows a robot's first fall means nothing."""
 
     env: LocomotionEnv
-    faults: list[Fault]
     poses: np.ndarray  # (T, N, nq), MuJoCo's qpos
     contacts: np.ndarray  # (T, N, L) bool, which feet were on the ground
     steps: np.ndarray  # (N,) up to the first fall
     distance: np.ndarray  # (N,) m, net displacement along the commanded heading up to then
     fall_time: np.ndarray  # (N,) s, of the first fall; the whole time if there was none
     returns: np.ndarray  # (N,) reward up to then
-
-    @property
-    def fell(self) -> np.ndarray:  # (N,) bool
-        return self.steps < len(self.poses)
+    fell: np.ndarray  # (N,) bool
 
 
 @torch.no_grad()
-def take_a_walk(policy, robot, faults, speed, seconds, seed=0, threads=0, **env_options) -> Walk:
-    """Robot i with faults[i], at speed m/s. env_options: of LocomotionEnv, as terrain and noise. A
-    fall is what ends an episode in training: the trunk on the ground or tilted by more than 60
-    degrees, or a simulation that diverges (that is said on stderr)."""
+def take_a_walk(policy, robot, faults, speed, seconds, seed=0, threads=0, seen=None, **sim) -> Walk:
+    """Robot i with faults[i], at speed m/s. seen: a list to which each step's observation is added.
+    sim: options of LocomotionEnv, as terrain and noise. A fall: the trunk on the ground or tilted
+    by more than 60 degrees, or a simulation that diverges (which is said on stderr)."""
     N, situations = len(faults), [(1.0, fault) for fault in faults]
     config, extras = straight_ahead(policy, speed, seconds), policy.extras
-    env = LocomotionEnv(robot, N, seed, threads, situations, config, extras, **env_options)
+    env = LocomotionEnv(robot, N, seed, threads, situations, config, extras, **sim)
     env.pin_faults(faults)  # one each
     feet = [env.model.sensor(f"contact_{leg}_foot").adr[0] for leg in env.robot.legs]
     observation, poses, contacts = env.reset(), [], []
@@ -60,6 +55,8 @@ def take_a_walk(policy, robot, faults, speed, seconds, seed=0, threads=0, **env_
     for _ in range(round(seconds / CONTROL_DT)):
         poses.append(env.world.bind("qpos").copy())
         contacts.append(env.world.bind("sensordata")[:, feet] > 0)
+        if seen is not None:
+            seen.append(observation)
         action = policy(to_tensors(observation, "cpu")).numpy()
         observation, reward, terminated, _, info = env.step(action)
         divergences += (upright & info["diverged"]).sum()
@@ -74,34 +71,15 @@ def take_a_walk(policy, robot, faults, speed, seconds, seed=0, threads=0, **env_
         print(f"simulations that diverged, counted as falls: {divergences}", file=sys.stderr)
     fall_time = np.where(upright, seconds, (steps + 1) * CONTROL_DT)
     poses, contacts = np.array(poses), np.array(contacts)
-    return Walk(env, faults, poses, contacts, steps, distance, fall_time, returns)
+    return Walk(env, poses, contacts, steps, distance, fall_time, returns, ~upright)
 
 
-def without_chatter(contacts: np.ndarray) -> np.ndarray:
-    """(T, L): each step takes the majority of itself and its two neighbours, so that a contact or a
-    flight of a single step (20 ms, a bounce) is no stride."""
-    padded = np.concatenate([contacts[:1], contacts, contacts[-1:]]).astype(int)
-    return padded[:-2] + padded[1:-1] + padded[2:] >= 2
-
-
-def stride_frequency(contacts: np.ndarray, dt: float) -> np.ndarray:
-    """(L,) Hz: strides from a foot's first touchdown to its last over their time; 0 if none."""
-    frequency = np.zeros(contacts.shape[1])
-    for leg, foot in enumerate(contacts.T):
-        touchdowns = np.flatnonzero(foot[1:] & ~foot[:-1])
-        if len(touchdowns) > 1:
-            frequency[leg] = (len(touchdowns) - 1) / ((touchdowns[-1] - touchdowns[0]) * dt)
-    return frequency
-
-
-def gait(walk: Walk, i: int) -> dict[str, np.ndarray] | None:
-    """Of robot i, from WARM_UP to its first fall (None if too soon): (L,) share of the time on the
-    ground (above 0.5 in a walk, below in a run), (L,) strides a second, () feet on the ground."""
-    steady = without_chatter(walk.contacts[: walk.steps[i], i])[round(WARM_UP / CONTROL_DT) :]
-    if len(steady) * CONTROL_DT < SHORTEST:
-        return None
-    strides, feet_down = stride_frequency(steady, CONTROL_DT), np.array(steady.sum(axis=1).mean())
-    return {"duty": steady.mean(axis=0), "stride_hz": strides, "feet_down": feet_down}
+def duty(walk: Walk, robots: range) -> np.ndarray:
+    """(L,) share of the time that each foot was down, from WARM_UP to the first fall, mean over
+    `robots`; above 0.5 in a walk, below in a run. NaN if that is too short for all of them."""
+    steady = [walk.contacts[round(WARM_UP / CONTROL_DT) : walk.steps[i], i] for i in robots]
+    shares = [x.mean(axis=0) for x in steady if len(x) * CONTROL_DT >= SHORTEST]
+    return np.mean(shares, axis=0) if shares else np.full(walk.contacts.shape[2], np.nan)
 
 
 def origin(path: Path, card: dict) -> dict:
@@ -109,14 +87,14 @@ def origin(path: Path, card: dict) -> dict:
     return {"method": card["policy"], "seed": card["seed"], "checkpoint": str(path)}
 
 
-def walk_cases(args, policies, cases: dict[str, Fault], speed: float, **env_options) -> list[dict]:
+def walk_cases(args, policies, cases: dict[str, str], speed: float, **sim) -> list[dict]:
     """Every policy on every case, `args.episodes` robots each: rows of the CSV file. Distance is as
     walked; `share` is of the commanded distance, at most 1 (to run ahead is no success)."""
     labels = [(case, episode) for case in cases for episode in range(args.episodes)]
     faults = [cases[case] for case, _ in labels]
     how, rows = (speed, args.seconds, args.seed, args.threads), []
     for path, (policy, card) in policies.items():
-        walk = take_a_walk(policy, args.robot, faults, *how, **env_options)
+        walk = take_a_walk(policy, args.robot, faults, *how, **sim)
         for i, (case, episode) in enumerate(labels):
             share, fell = min(1.0, walk.distance[i] / (speed * args.seconds)), walk.fell[i]
             rows.append(origin(path, card) | {
@@ -129,34 +107,26 @@ def walk_cases(args, policies, cases: dict[str, Fault], speed: float, **env_opti
     return rows
 
 
-def cell(rows: list[dict], method: str, case: str, column: str) -> tuple[float, float]:
-    """Mean over seeds of the mean over episodes; deviation over seeds (over episodes if one)."""
-    mine = [row for row in rows if row["method"] == method and row["case"] == case]
-    seeds = [[float(r[column]) for r in mine if r["seed"] == s] for s in {r["seed"] for r in mine}]
-    means = [np.mean(values) for values in seeds]
-    return float(np.mean(means)), float(np.std(means) if len(means) > 1 else np.std(seeds[0]))
+def by_seed(rows: list[dict], column: str, **where) -> np.ndarray:
+    """(seeds, episodes) of the rows where these columns have these values."""
+    rows = [row for row in rows if all(row[key] == value for key, value in where.items())]
+    seeds = dict.fromkeys(row["seed"] for row in rows)
+    values = [[float(row[column]) for row in rows if row["seed"] == seed] for seed in seeds]
+    return np.array(values or [[np.nan]])
 
 
-def report(args, rows, name: str, title: str, columns: dict[str, str], marks={}) -> dict:
-    """Writes the CSV file, prints a table of each of the columns {column: what} and of the falls.
-    marks: {case: a remark}. Returns {what: {method: (means, deviations)}} for a chart."""
-    write_csv(args.out / f"{name}.csv", rows)
-    methods, cases = ([*dict.fromkeys(row[key] for row in rows)] for key in ("method", "case"))
-    panels = {}
-    print(f"\n{title}")
-    for column, what in (columns | {"fell": "episodes with a fall"}).items():
-        print(f"\n{what:22}" + "".join(f"{case + marks.get(case, ''):>15}" for case in cases))
-        panels[what] = {}
-        for method in methods:
-            pairs = [cell(rows, method, case, column) for case in cases]
-            panels[what][method] = [*zip(*pairs)]
-            words = [f"{m:.0%}" if column == "fell" else f"{m:.2f} ± {d:.2f}" for m, d in pairs]
-            print(f"{method:22}" + "".join(f"{word:>15}" for word in words))
-    return {what: panels[what] for what in columns.values()}
+def mean_and_interval(values: np.ndarray) -> tuple[float, float, float]:
+    """Of (seeds, episodes) the mean and its 95 %, by a bootstrap of seeds and of their episodes."""
+    rng, (S, E) = np.random.default_rng(0), values.shape
+    seeds, episodes = rng.integers(S, size=(2000, S, 1)), rng.integers(E, size=(2000, S, E))
+    low, high = np.percentile(values[seeds, episodes].mean(axis=(1, 2)), (2.5, 97.5))
+    return float(values.mean()), float(low), float(high)
 
 
-def write_csv(path: Path, rows: list[dict]) -> None:
-    with open(path, "w", newline="") as file:
+def write_csv(path: Path, rows: list[dict], mode: str = "w") -> None:
+    """mode "a": adds rows to those in the file."""
+    with open(path, mode, newline="") as file:
         writer = csv.DictWriter(file, list(rows[0]))
-        writer.writeheader()
+        if mode == "w":
+            writer.writeheader()
         writer.writerows(rows)

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from env import EnvConfig, LocomotionEnv
-from faults import REAL_WORLD, disable, half_lock, healthy, lock, skate, tow, weaken
+from faults import HEALTHY, REAL_WORLD
 from robots import A1, BOX_FRICTION, BOX_MASS, GO1, SLACK, TETHER, build_model
 
 QUIET = EnvConfig(push_speed=0.0, start_speed=0.0, start_pose=(1.0, 1.0), friction=(1.0, 1.0))
@@ -48,7 +48,7 @@ def test_the_tether_pulls_and_never_pushes(tied):
 def test_the_box_hangs_on_its_own_robot_alone():
     """Both boxes are pulled by 10 N more than their friction; the second robot has none."""
     config = EnvConfig(push_speed=0.0, start_speed=0.0, friction=(1.25, 1.25))
-    env = make(tow("RR"), healthy(), config=config)
+    env = make("tow:RR", HEALTHY, config=config)
     box, geom = env.model.body("box").id, env.model.geom("box").id
     assert env.world.expanded("geom_friction")[:, geom, 0] == pytest.approx(BOX_FRICTION)
     assert env.model.body("box").mass == pytest.approx(BOX_MASS)
@@ -62,7 +62,7 @@ def test_the_box_hangs_on_its_own_robot_alone():
 def test_a_half_lock_stops_one_side_only():
     """Asked to open by 0.5 rad the calf stays at the string; it bends like a healthy one."""
     for target, stopped in ((-1.0, True), (-2.0, False)):
-        env = make(half_lock("RR_calf", -1.5), healthy())
+        env = make("half-lock:RR_calf:-1.5", HEALTHY)
         action = np.zeros((2, 4, 3))
         action[:, 2, 2] = (target + 1.5) / GO1.action_scale
         for _ in range(40):
@@ -76,14 +76,14 @@ def test_a_half_lock_stops_one_side_only():
 
 
 def test_a_half_locked_leg_starts_on_the_right_side_of_its_string():
-    env = make(*[half_lock("RR_calf", -1.5)] * 50, config=EnvConfig())
+    env = make(*["half-lock:RR_calf:-1.5"] * 50, config=EnvConfig())
     assert (env.joint_error[:, 2, 2] <= 1e-9).all() and (env.joint_error[:, 3, 2] > 0.1).any()
 
 
 def test_a_skate_rolls_forward_grips_sideways_and_acts_on_its_foot_alone():
     """Standing feet are pushed for half a second: only the skate moves, and only forward."""
     for axis, rolls in ((0, True), (1, False)):
-        env = make(skate("FR"), healthy())
+        env = make("skate:FR", HEALTHY)
         for _ in range(50):
             env.step(np.zeros((2, 12)))  # settle
         names = [env.model.geom(f"{leg}_foot").id for leg in GO1.legs]
@@ -99,7 +99,7 @@ def test_a_skate_rolls_forward_grips_sideways_and_acts_on_its_foot_alone():
 
 def test_reset_undoes_every_fault():
     """Healthy again, a robot's model fields are the healthy model's, to the bit."""
-    stiff = lock("FR_calf") + disable("FL_thigh") + weaken("RR", 0.3)
+    stiff = "lock:FR_calf+disable:FL_thigh+weaken:RR:0.3"
     env = make(stiff, *(REAL_WORLD[name] for name in ("weaken", "box", "skates")))
     changed = {
         "actuator_gainprm": [True, True, False, False],
@@ -116,7 +116,7 @@ def test_reset_undoes_every_fault():
     assert env.world.bind("eq_active").any(axis=1).tolist() == [True, False, False, False]
     for _ in range(20):
         env.step(np.random.default_rng(0).normal(size=(4, 12)))
-    env.pin_faults([healthy()] * 4)
+    env.pin_faults([HEALTHY] * 4)
     env.reset()
     assert not env.world.bind("eq_active").any()
     for name, value in healthy_one.items():
@@ -128,11 +128,11 @@ def test_reset_undoes_every_fault():
 @pytest.mark.parametrize(
     "fault, says",
     [
-        (half_lock("RR_calf", 0.5), "RR_calf turns from -2.818 to -0.888 rad: no stop at 0.5"),
-        (half_lock("MR_calf", -1.5), "no joint or leg 'MR_calf'"),
-        (lock("MR_calf"), "no joint or leg 'MR_calf'; it has the legs FR, FL, RR, RL"),
-        (tow("MR"), "no leg MR"),
-        (skate("FR_calf"), "no leg FR_calf"),
+        ("half-lock:RR_calf:0.5", "RR_calf turns from -2.818 to -0.888 rad: no stop at 0.5"),
+        ("half-lock:MR_calf:-1.5", "no joint or leg 'MR_calf'"),
+        ("lock:MR_calf", "no joint or leg 'MR_calf'; it has FR_hip, FR_thigh"),
+        ("tow:MR", "no leg MR"),
+        ("skate:FR_calf", "no leg FR_calf"),
     ],
 )
 def test_what_the_robot_does_not_have_is_refused(fault, says):
@@ -141,7 +141,7 @@ def test_what_the_robot_does_not_have_is_refused(fault, says):
 
 
 def test_a_box_that_was_not_built_is_refused():
-    env = make(healthy())
-    env.pin_faults([tow("RR")])
-    with pytest.raises(ValueError, match="no box or wheel for tow:RR: make the env with this"):
+    env = make(HEALTHY)
+    env.pin_faults(["tow:RR"])
+    with pytest.raises(ValueError, match="no RR, box or wheel for tow:RR: make the env with this"):
         env.reset()

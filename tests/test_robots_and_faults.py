@@ -1,14 +1,13 @@
 """The model against its data sheet, and faults on simulated robots."""
 
-from dataclasses import fields, replace
+from dataclasses import replace
 
 import mujoco
 import numpy as np
 import pytest
 
 from env import EnvConfig, LocomotionEnv
-from faults import REAL_WORLD, TASKS, Fault
-from faults import disable, half_lock, healthy, lock, motor_strength, parse, skate, tow, weaken
+from faults import HEALTHY, KINDS, REAL_WORLD, TASKS, faulty_model, harms_of, other_harms
 from robots import A1, ROBOTS, build_model
 
 QUIET = EnvConfig(push_speed=0.0, start_speed=0.0, start_pose=(1.0, 1.0), friction=(1.0, 1.0))
@@ -62,25 +61,12 @@ def test_legs_are_mirror_images(robot):
         assert place == pytest.approx(twin * [1, -1, 1], abs=1e-6)
 
 
-@pytest.mark.parametrize(
-    "change, says",
-    [
-        ({"legs": ("FR", "FL", "RR")}, "every leg has a name of its own, a mount"),
-        ({"legs": ("FR", "FL", "RR", "RR")}, "every leg has a name of its own"),
-        ({"links": A1.links[:2]}, "every link has a name of its own, and an angle in the pose"),
-        ({"default_pose": ((-0.1, 0.8, 1.5),) * 4}, "FR_calf at 1.5 rad is beyond its stops"),
-    ],
-)
-def test_a_robot_that_does_not_fit_together_is_refused(change, says):
-    with pytest.raises(ValueError, match=says):
-        replace(A1, **change)
-
-
-def test_a_link_that_cannot_be_mirrored_is_refused():
-    with pytest.raises(ValueError, match="only axes along x, y or z"):
-        replace(A1.links[0], axis=(0.8, 0.6, 0))
-    with pytest.raises(ValueError, match="the stops of the thigh would have to be mirrored"):
-        replace(A1.links[1], rear_mirrors_x=True)
+def test_a_robot_that_does_not_fit_together_is_refused():
+    for change in ({"legs": A1.legs[:3]}, {"links": A1.links[:2]}):
+        with pytest.raises(ValueError, match="zip"):
+            build_model(replace(A1, **change))
+    with pytest.raises(ValueError, match="the first leg must be a right one"):
+        replace(A1, mounts=A1.mounts[::-1])
 
 
 @pytest.mark.parametrize("robot", ROBOTS)
@@ -96,7 +82,8 @@ def test_stands_under_zero_action(robot):
 
 def test_locked_joint_holds_under_load_and_is_free_after_reset():
     """FR calf locked, 20 kg on its back and the policy flailing: it stays. Healthy, it moves."""
-    env = LocomotionEnv("a1", 1, num_threads=1, faults=((1.0, lock("FR_calf")),), config=QUIET)
+    faults = ((1.0, "lock:FR_calf"),)
+    env = LocomotionEnv("a1", 1, num_threads=1, faults=faults, config=QUIET)
     env.reset()
     rng = np.random.default_rng(0)
     trunk = env.model.body("trunk").id
@@ -104,7 +91,7 @@ def test_locked_joint_holds_under_load_and_is_free_after_reset():
         env.world.bind("xfrc_applied")[:, trunk, 2] = -20 * 9.81  # N; a reset clears it
         env.step(rng.normal(size=(1, 12)))
         assert abs(env.joint_error[0, 0, 2]) < 0.01
-    env.pin_faults([healthy()])
+    env.pin_faults([HEALTHY])
     env.reset()
     env.world.bind("xfrc_applied")[:] = 0
     for _ in range(25):
@@ -115,7 +102,7 @@ def test_locked_joint_holds_under_load_and_is_free_after_reset():
 def test_weak_motor_gives_its_share_of_the_torque():
     """Same state, same target: half the strength is half the force, and half the clipping limit."""
     env = LocomotionEnv("a1", 3, num_threads=1, config=QUIET)
-    env.pin_faults([weaken("FL", 0.5), healthy(), disable("RL_thigh")])
+    env.pin_faults(["weaken:FL:0.5", HEALTHY, "disable:RL_thigh"])
     env.reset()
     for action in (0.5, 10.0):  # 10: 2.5 rad away, 50 N m asked of 33.5
         env.world.bind("ctrl")[:] = (env._default + 0.25 * action).reshape(-1)
@@ -135,19 +122,34 @@ def test_training_faults_are_drawn_with_their_odds():
     assert np.array_equal(env.world.bind("eq_active").sum(axis=1), locked)  # nothing else is locked
 
 
-def test_fault_names_read_back():
-    """A field that `__str__` or `parse` forgets makes a fault that calls itself healthy in tables
-    and checkpoints."""
-    tied = half_lock("FR_calf", -1.0)
-    one_each = lock("FR_calf"), weaken("FR", 0.5), tied, tow("FR"), skate("FR")
-    for field in fields(Fault):
-        having = [fault for fault in one_each if getattr(fault, field.name)]
-        assert len(having) == 1, f"an example with {field.name} is missing above"
-    thirds = weaken("FR", 1 / 3) + half_lock("RR_calf", -4 / 3)  # to the last digit
-    all_of_it = lock("FR_calf") + weaken("RL", 0.5) + tow("RR") + skate("FL")
-    for fault in (*one_each, healthy(), disable("FL_hip"), *REAL_WORLD.values(), thirds, all_of_it):
-        assert parse(str(fault)) == fault and (str(fault) == "healthy") == (fault == Fault())
-    assert motor_strength(all_of_it, A1).tolist() == [1, 1, 0] + [1] * 6 + [0.5] * 3
+def test_faults_are_read_from_words():
+    assert harms_of(HEALTHY) == [] and harms_of("lock:FR_calf") == [("lock", "FR_calf", 0.0)]
+    for kind, numbers in KINDS.items():
+        assert harms_of(f"{kind}:FR" + ":0.25" * numbers) == [(kind, "FR", 0.25 * numbers)]
+    for fault in (*REAL_WORLD.values(), *TASKS["damage"].unseen):
+        assert [harm.kind for harm in harms_of(fault)] or fault == HEALTHY
+
+
+def test_faults_add_up():
+    healthy, both = build_model(A1), "lock:FR_calf+weaken:RL:0.5+weaken:RL_hip:0.5"
+    model = faulty_model(both, A1, healthy)
+    share = model.actuator_forcerange[:, 1] / healthy.actuator_forcerange[:, 1]
+    assert share.tolist() == [1, 1, 0] + [1] * 6 + [0.25, 0.5, 0.5]
+    assert model.eq_active0.nonzero()[0].tolist() == [2] and not healthy.eq_active0.any()
+
+
+def test_critics_are_told_of_every_harm():
+    """Locks, motors and friction read off the simulation, all else by its number."""
+    faults = ["healthy", "lock:FR_calf", "weaken:FL:0.5", "half-lock:RR_calf:-1.5", "skate:FR"]
+    options = {"faults": [(0.2, fault) for fault in faults], "extras": ("privileged",)}
+    env = LocomotionEnv("a1", 5, num_threads=1, config=QUIET, **options)
+    env.pin_faults(faults)
+    told = env.reset().privileged
+    assert told.shape == (5, 2 * 12 + 1 + 2)
+    assert told[0].tolist() == [0] * 12 + [1] * 12 + [1] + [0, 0]
+    assert (told[1] != told[0]).nonzero()[0].tolist() == [2, 14]  # locked, and its motor off
+    assert told[2, 15:18].tolist() == [0.5] * 3 and told[3, -2:].tolist() == [-1.5, 0]
+    assert told[4, -2:].tolist() == [0, 1] and not other_harms(faults[:3]).size
 
 
 @pytest.mark.parametrize("text", [
@@ -155,5 +157,5 @@ def test_fault_names_read_back():
     "tow", "half-lock:RR_calf", "half-lock:RR_calf:nan", "half-lock:RR_calf:x", "skate:FR:2",
 ])  # fmt: skip
 def test_unreadable_faults_are_refused(text):
-    with pytest.raises(ValueError, match="lock:FR_calf|no joint"):
-        motor_strength(parse(text), A1)
+    with pytest.raises(ValueError, match="lock:FR_calf|no joint|no stop at nan"):
+        faulty_model(text, A1, build_model(A1))

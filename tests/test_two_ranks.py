@@ -40,7 +40,7 @@ def updated(world_size: int, rank: int = 0) -> dict:
 
     learner = Learner(policy, critic, PPOConfig(epochs=1, minibatches=1))
     stats = learner.update(buffer, torch.Generator().manual_seed(rank))
-    gradient = torch.cat([p.grad.flatten() for p in learner.parameters.values()])
+    gradient = torch.cat([p.grad.flatten() for p in learner.parameters])
     result = {"gradient": gradient, "learning_rate": learner.optimizer.param_groups[0]["lr"]}
     return result | {"stats": stats, "weights": policy.state_dict()}
 

@@ -1,5 +1,6 @@
 """Every number of the results: walks on a world that plays back what was written by hand, gaits."""
 
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -7,9 +8,13 @@ import pytest
 import torch
 
 import walk
+from checkpoint import load_policy
 from env import CONTROL_DT, Observation
-from faults import healthy, lock, skate
+from faults import HEALTHY
 from robots import A1
+from terrain import Terrain
+
+ROOT = Path(__file__).resolve().parent.parent
 
 
 class Playback:
@@ -25,7 +30,7 @@ class Playback:
         self.world = SimpleNamespace(bind=lambda name: np.zeros((num_envs, 1)))
 
     def pin_faults(self, faults):
-        words = [(bool(fault.locked), bool(fault.skating)) for fault in faults]
+        words = [("lock" in fault, "skate" in fault) for fault in faults]
         self.locked, self.skating = np.array(words).T
 
     def reset(self):
@@ -51,14 +56,16 @@ def policy(monkeypatch):
 
 
 def test_an_episode_ends_with_the_first_fall(policy):
-    walked = walk.take_a_walk(policy, "a1", [healthy(), lock("FR_calf")], 0.75, 10 * CONTROL_DT)
+    faults = [HEALTHY, "lock:FR_calf"]
+    walked = walk.take_a_walk(policy, "a1", faults, 0.75, 10 * CONTROL_DT)
     assert walked.distance == pytest.approx([10 * 0.1, 3 * 0.2])
     assert walked.fall_time == pytest.approx([10 * CONTROL_DT, 3 * CONTROL_DT])
     assert walked.returns == pytest.approx([10, 3]) and walked.fell.tolist() == [False, True]
 
 
 def test_a_simulation_that_diverges_ends_where_it_last_was_and_is_told(policy, capsys):
-    walked = walk.take_a_walk(policy, "a1", [healthy(), skate("FR")], 0.75, 10 * CONTROL_DT)
+    faults = [HEALTHY, "skate:FR"]
+    walked = walk.take_a_walk(policy, "a1", faults, 0.75, 10 * CONTROL_DT)
     assert walked.distance == pytest.approx([10 * 0.1, 3 * 0.2])
     assert walked.returns == pytest.approx([10, 3])
     assert walked.fall_time == pytest.approx([10 * CONTROL_DT, 4 * CONTROL_DT])
@@ -68,24 +75,37 @@ def test_a_simulation_that_diverges_ends_where_it_last_was_and_is_told(policy, c
 def test_rows_name_their_case_and_overspeed_is_no_success(policy):
     args = SimpleNamespace(robot="a1", episodes=2, seconds=10 * CONTROL_DT, seed=0, threads=1)
     policies = {"a.pt": (policy, {"policy": "mlp", "seed": 7})}
-    cases = {"healthy": healthy(), "FR": lock("FR_calf")}
+    cases = {"healthy": HEALTHY, "FR": "lock:FR_calf"}
     rows = walk.walk_cases(args, policies, cases, speed=8.0)  # 1.6 m commanded
     assert {(row["method"], row["seed"]) for row in rows} == {("mlp", 7)}
     told = [(row["case"], row["episode"], float(row["distance_m"])) for row in rows]
     assert told == [("healthy", 0, 1.0), ("healthy", 1, 2.0), ("FR", 0, 0.9), ("FR", 1, 1.2)]
     assert [float(row["share"]) for row in rows] == [0.625, 1.0, 0.5625, 0.75]
     assert [(row["fell"], row["success"]) for row in rows] == [(0, 1), (0, 1), (1, 0), (1, 0)]
-    fast = walk.walk_cases(args, policies, {"healthy": healthy()}, speed=1.0)
+    fast = walk.walk_cases(args, policies, {"healthy": HEALTHY}, speed=1.0)
     assert [float(row["share"]) for row in fast] == [1.0, 1.0]
     assert float(fast[1]["distance_m"]) == 2.0
 
 
 def test_a_cell_is_the_mean_over_seeds_of_the_mean_over_episodes():
-    """Seed 0: 1 and 3; seed 1: 7 four times. 2 and 7, hence 4.5 and a deviation of 2.5."""
-    walked, common = [(0, 1), (0, 3)] + [(1, 7)] * 4, {"method": "rolt", "case": "FR"}
-    rows = [common | {"seed": seed, "distance_m": x} for seed, x in walked]
-    assert walk.cell(rows, "rolt", "FR", "distance_m") == (4.5, 2.5)
-    assert walk.cell(rows[:2], "rolt", "FR", "distance_m") == (2.0, 1.0)  # one seed: its episodes
+    """Seed 0: 1 and 3; seed 1: 7 and 9. 2 and 8, hence 5; a drawn mean of seeds is 1 to 9."""
+    walked = [(0, 1), (0, 3), (1, 7), (1, 9)]
+    rows = [{"method": "rolt", "case": "FR", "seed": seed, "distance_m": x} for seed, x in walked]
+    others = [row | {"method": "mlp", "distance_m": 100} for row in rows]
+    values = walk.by_seed(others + rows, "distance_m", method="rolt", case="FR")
+    assert values.tolist() == [[1, 3], [7, 9]]
+    mean, low, high = walk.mean_and_interval(values)
+    assert mean == 5 and 1 <= low < 2 < 8 < high <= 9  # both seeds the same one: 1 in 4 draws
+    assert walk.mean_and_interval(values[:1])[0] == 2  # one seed: its episodes
+    assert walk.mean_and_interval(np.full((3, 32), 7.0)) == (7, 7, 7)
+    assert np.isnan(walk.by_seed(rows, "distance_m", case="RL")).all()
+
+
+def test_the_interval_covers_what_it_should():
+    """Seeds 0 and 1, episodes alike: the mean of two drawn seeds is 0, 1/2 or 1, by 1, 2, 1 in 4;
+    of five, as often as a binomial says."""
+    seeds = np.repeat(np.array([[0.0], [0], [0], [1], [1]]), 4, axis=1)
+    assert walk.mean_and_interval(seeds) == pytest.approx((0.4, 0.0, 0.8))
 
 
 def pattern(*feet: str) -> np.ndarray:
@@ -93,27 +113,21 @@ def pattern(*feet: str) -> np.ndarray:
     return np.array([[mark == "#" for mark in foot] for foot in feet]).T
 
 
-TROT = pattern("##..##..##..", "..##..##..##", "############", "............")
-
-
-def test_stride_frequency_by_hand():
-    """Touchdowns at 4, 8 and at 2, 6, 10: a stride of 4 steps of 20 ms is 12.5 Hz."""
-    assert walk.stride_frequency(TROT, 0.02) == pytest.approx([12.5, 12.5, 0.0, 0.0])
-    few = pattern("..####..", ".#..#..#")  # a single touchdown is no stride
-    assert walk.stride_frequency(few, 0.1) == pytest.approx([0.0, 2 / 0.6])
-
-
-def test_chatter_of_a_single_step_is_no_stride():
-    before, after = pattern("###.###...#...##"), pattern("#######.......##")
-    assert np.array_equal(walk.without_chatter(before), after)
-    assert np.array_equal(walk.without_chatter(TROT), TROT)
-
-
 def test_a_gait_is_measured_after_the_start_or_not_at_all():
     """2 s of standing (100 steps) do not count; less than 1 s (50 steps) after is too little."""
-    contacts = np.concatenate([np.ones((100, 4), dtype=bool), np.tile(TROT, (5, 1))])[:, None]
-    measured = walk.gait(SimpleNamespace(contacts=contacts, steps=[160]), 0)
-    assert measured["duty"] == pytest.approx([0.5, 0.5, 1.0, 0.0])
-    assert measured["feet_down"] == pytest.approx(2.0)
-    assert measured["stride_hz"] == pytest.approx([12.5, 12.5, 0.0, 0.0])
-    assert walk.gait(SimpleNamespace(contacts=contacts, steps=[149]), 0) is None
+    trot = pattern("##..##..##..", "..##..##..##", "############", "............")
+    contacts = np.concatenate([np.ones((100, 4), dtype=bool), np.tile(trot, (5, 1))])[:, None]
+    contacts = np.concatenate([contacts, contacts[::-1]], axis=1)  # the second robot fell too soon
+    walked = SimpleNamespace(contacts=contacts, steps=[160, 149])
+    assert walk.duty(walked, range(2)) == pytest.approx([0.5, 0.5, 1.0, 0.0])
+    assert np.isnan(walk.duty(walked, range(1, 2))).all()
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "checkpoints").glob("*.pt")), ids=lambda p: p.stem)
+def test_what_is_shipped_walks(path):
+    """Healthy, 3 s at its test's speed, at 60 % of it or more: it takes a moment to start."""
+    policy, card = load_policy(path)
+    stairs = Terrain(("stairs",), (-1,)) if card["task"] == "terrain" else None
+    speed, robots = 0.5 if stairs else 0.75, [HEALTHY] * 4
+    walked = walk.take_a_walk(policy, card["robot"], robots, speed, 3.0, 0, 1, terrain=stairs)
+    assert not walked.fell.any() and walked.distance.mean() > 0.6 * speed * 3.0
