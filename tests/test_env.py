@@ -13,6 +13,7 @@ from robots import A1
 # No chance but the command: what a test puts there stays.
 QUIET = EnvConfig(start_speed=0.0, push_speed=0.0, start_pose=(1.0, 1.0))
 
+
 def rollout(threads=1, seed=0, steps=60):
     env = LocomotionEnv("a1", 8, seed, threads, TASKS["stiffness"].training)
     env.reset(random_ages=True)

@@ -47,8 +47,7 @@ def test_skates_begin_a_new_episode_and_again_does(show):
     flat = watch.Show(show.policy, "a1", HEALTHY, 0.75, 0, None, "clean")
     env = flat.env
     flat.hear("skate:FR")
-    assert flat.env is not env and flat.fault == "skate:FR"
-    assert flat.data.qpos.size == 20
+    assert flat.env is not env and flat.fault == "skate:FR" and flat.data.qpos.size == 20
     env = flat.env
     flat.hear("again")
     assert flat.env is not env and flat.fault == "skate:FR"
@@ -77,8 +76,7 @@ def test_films_are_written_without_a_display(tmp_path, monkeypatch):
         pytest.skip(f"nothing can be drawn here: {one.stderr}")
     film = Image.open(tmp_path / "one.gif")
     assert (film.n_frames, film.size) == (10, (480, 300))  # every second step of 20
-    colours = np.unique(np.asarray(film.convert("RGB")).reshape(-1, 3), axis=0)
-    assert len(colours) > 10  # something is to be seen
+    assert len(film.convert("RGB").getcolors(1 << 16)) > 10  # something is to be seen
 
 
 def test_nothing_but_the_faulty_leg_is_painted(show):
