@@ -57,8 +57,10 @@ MAX_ACTION = 10.0  # ours: 2.5 rad (hexapod: 1.5) off the default pose, far more
 MAX_SPEED = 1000.0  # m/s, rad/s, ours: flailing at the motors' limits reaches 100
 MAX_TILT = np.cos(np.deg2rad(60))  # ours: past it none gets up again; legged_gym waits for contact
 EXTRAS = ("privileged", "heights", "past", "situation")
-SAVED = """action last_action history command heading air_time age first_age command_age
-    episode_return fault_index _last_contact row start""".split()
+SAVED = (
+    "action", "last_action", "history", "command", "heading", "air_time", "age", "first_age",
+    "command_age", "episode_return", "fault_index", "_last_contact", "row", "start",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -113,6 +115,7 @@ class LocomotionEnv:
         self._qpos, self._qvel, self._ctrl = map(world.bind, ("qpos", "qvel", "ctrl"))
         self._torque, self._contacts = map(world.bind, ("actuator_force", "sensordata"))
         self._friction, self.fault_writer = world.expand("geom_friction"), FaultWriter(robot, world)
+        self._rotation = world.bind("xmat")[:, model.body("trunk").id]
         self._geoms = model.sensor_objid  # the robot's own: 0 the trunk, then each leg's
         self._foot_sensors = feet = [model.sensor(f"contact_{leg}_foot").id for leg in robot.legs]
         self._link_sensors = [i for i in range(1, model.nsensor) if i not in feet]
@@ -307,16 +310,12 @@ class LocomotionEnv:
     def _read_state(self) -> None:
         """The table's terms. qvel is linear in the world's frame and angular in the trunk's."""
         shape = self.action.shape
-        w, x, y, z = self._qpos[:, 3:7].T
+        rotation = self._rotation.reshape(-1, 3, 3)  # (N, 9) -> (N, 3, 3), trunk -> world
         self.position = self._qpos[:, :3].copy()
-        self.yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
-        forward = [1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)]
-        left = [2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)]
-        up = [2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)]
-        rotation = np.array([forward, left, up]).transpose(2, 0, 1)  # (N, 3, 3), world -> trunk
-        self.linear_velocity = np.einsum("nij,nj->ni", rotation, self._qvel[:, :3])
+        self.yaw = np.arctan2(rotation[:, 1, 0], rotation[:, 0, 0])
+        self.linear_velocity = np.einsum("nji,nj->ni", rotation, self._qvel[:, :3])
         self.angular_velocity = self._qvel[:, 3:6].copy()
-        self.gravity = -rotation[:, :, 2]
+        self.gravity = -rotation[:, 2]
         self.joint_error = self._qpos[:, self._angle_at].reshape(shape) - self._default
         self.joint_velocity = self._qvel[:, self._velocity_at].reshape(shape)
         self.torque = self._torque.reshape(shape)

@@ -153,7 +153,7 @@ def attention(args, policies) -> None:
         panels[scan] = {"scandots [m]": heights[0] / HEIGHT_SCALE}
         shown = to_tensors(seen[-1]._replace(heights=heights), "cpu")
         for path, (policy, card) in policies.items():
-            weights = policy.attention(shown)[0, -1, :, :, -NUM_PATCHES:].mean((0, 1)).numpy()
+            weights = policy.attention(shown)[0, :, :, -NUM_PATCHES:].mean((0, 1)).numpy()
             weights /= weights.sum()
             panels[scan][card["policy"]] = weights.reshape(GRID)
             share = weights[patches].sum()
@@ -303,7 +303,7 @@ def find_policies(args, methods) -> dict[Path, tuple]:
     names = [(card["policy"], card["seed"]) for _, card in found.values()]
     if len(set(names)) < len(names):  # how a policy grew: told apart by their steps
         for _, card in found.values():
-            card["policy"] += f" {card['steps'] / 1e6:g}M"
+            card["policy"] += f" {card['steps'] / 1e6:.1f}M"
     names = [(card["policy"], card["seed"]) for _, card in found.values()]
     if len(set(names)) < len(names):
         sys.exit("error: two of the checkpoints are of the same method, seed and steps")

@@ -3,9 +3,11 @@
 from pathlib import Path
 
 import numpy as np
-from matplotlib import rcParams
+from matplotlib import colormaps, cycler, rcParams
 from matplotlib.figure import Figure
 
+COLOURS = colormaps["tab20"].colors
+rcParams["axes.prop_cycle"] = cycler(color=COLOURS[::2] + COLOURS[1::2])  # ten dark, ten light
 rcParams.update({"font.size": 8, "axes.titlesize": 8, "legend.frameon": False})
 
 

@@ -5,7 +5,7 @@ legs are its mirror image in y, rear legs in x where `Link.rear_mirrors_x` says 
 FR, FL, RR, RL (front or rear; the hexapod's front, middle, hind), their joints hip, thigh, calf. A
 new robot is a `Robot(...)` at the end of this file and an entry in `ROBOTS`.
 
-What a fault (faults.py) changes on one robot is prepared here, so that a fault is only numbers:
+What a fault (faults.py) changes on one robot is prepared here:
 
     joint lock      an inactive equality constraint a joint  eq_active
     motor strength  a position actuator a joint              actuator_gainprm, _biasprm, _forcerange

@@ -3,8 +3,8 @@
 Where each equation is:
     eq. 1  e^l = MLP(s^l)             `leg_embedding`, one network for all legs
     eq. 2  e^a = W a_{t-1} + b        `action_embedding`, by it a leg finds out which one it is
-    eq. 3  e^prop = [e^l..., e^a]     `tokens`, followed where the policy reads the scan by the 12
-           patches e^h = linear(s^h) + p_e
+    eq. 3  e^prop = [e^l..., e^a]     `tokens`; where the policy reads the scan, 12 patches follow,
+                                      e^h = linear(s^h) + p_e
     III-B  two encoder layers, linear decoder on the leg tokens     `EncoderLayer`, `forward`
     III-C  feature dropout, position embedding (PE) dropout         `sample_masks`, `drop`, `tokens`
 
@@ -179,9 +179,8 @@ class ROLT(nn.Module):
         return self.decoder(self.norm(x)).flatten(1)  # (B, L, J) -> (B, L*J)
 
     def attention(self, observation) -> Tensor:
-        """(B, layers, heads, L, T) attention of the legs to [legs, action, patches], at test."""
-        _, attention = self._encode(observation, {})
-        return torch.stack([weights[:, :, : self.num_legs] for weights in attention], dim=1)
+        """(B, heads, L, T), how the last layer's legs attend to [legs, action, patches], at test."""
+        return self._encode(observation, {})[1]
 
     def tokens(self, observation, masks: Masks) -> Tensor:
         """E_0 = [e^prop, e^h], (B, T, D)."""
@@ -192,7 +191,7 @@ class ROLT(nn.Module):
             tokens.append(self.action_embedding(observation.action)[:, None])  # (B, 1, D), eq. 2
 
         if config.scan:
-            # s = patch: (B, 4s, 3s) -> (B, 4, s, 3, s) -> (B, 4, 3, s, s) -> (B, P, s*s)
+            # s = PATCH: (B, 4s, 3s) -> (B, 4, s, 3, s) -> (B, 4, 3, s, s) -> (B, P, s*s)
             squares = observation.heights.unflatten(2, (GRID[1], -1)).unflatten(1, (GRID[0], -1))
             patches = self.patch_embedding(squares.transpose(2, 3).flatten(3).flatten(1, 2))
             position = self.patch_position
@@ -200,7 +199,7 @@ class ROLT(nn.Module):
                 keep = masks["patch_position"][:, :, None]
                 position = torch.where(keep, position, self.dropped_position)  # (B, P, D)
             tokens.append(patches + position)
-        return torch.cat([part.float() for part in tokens], dim=1)  # eq. 3
+        return torch.cat([part.float() for part in tokens], dim=1)  # eq. 3, then the patches
 
     def _queries(self, layer: int) -> int:
         """How many tokens a layer updates: those read afterwards; after the last, only the legs."""
@@ -208,11 +207,10 @@ class ROLT(nn.Module):
             return self.num_legs
         return self.num_legs + (self.config.identity == "action") + NUM_PATCHES * self.config.scan
 
-    def _encode(self, observation, masks: Masks) -> tuple[Tensor, list[Tensor]]:
-        """The leg tokens after the last layer (B, L, D), and every layer's attention weights."""
-        x, attention = self.tokens(observation, masks), []
+    def _encode(self, observation, masks: Masks) -> tuple[Tensor, Tensor]:
+        """The leg tokens after the last layer (B, L, D), and its attention (B, heads, L, T)."""
+        x = self.tokens(observation, masks)
         for i, layer in enumerate(self.encoder):
             keep = masks.get(f"attention_{i}"), masks.get(f"feedforward_{i}")
-            x, weights = layer(x, self._queries(i), *keep)
-            attention.append(weights)
+            x, attention = layer(x, self._queries(i), *keep)
         return x, attention

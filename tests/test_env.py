@@ -118,12 +118,14 @@ def test_body_velocities_and_gravity_are_in_the_trunks_frame():
     env.reset()
     env._qpos[0, 3:7] = [np.sqrt(0.5), 0, 0, np.sqrt(0.5)]
     env._qvel[0, :6] = [1, 0, 0, 0, 0, 0.7]
+    env.world.forward()
     env._read_state()
     assert env.yaw[0] == pytest.approx(np.pi / 2)
     assert env.linear_velocity[0] == pytest.approx([0, -1, 0])
     assert env.angular_velocity[0] == pytest.approx([0, 0, 0.7])
     assert env.gravity[0] == pytest.approx([0, 0, -1])
     env._qpos[0, 3:7] = [np.cos(0.15), 0, np.sin(0.15), 0]
+    env.world.forward()
     env._read_state()
     assert env.gravity[0] == pytest.approx([np.sin(0.3), 0, -np.cos(0.3)])
 

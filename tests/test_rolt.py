@@ -122,9 +122,9 @@ def test_patches_are_neighbouring_points():
 
 @torch.no_grad()
 def test_positions_start_as_large_as_what_they_are_added_to():
-    """Root mean squares; inputs of order 1, heights of a robot on its feet. Not 0.02 beside 0.6."""
+    """Root mean squares; inputs of order 1, heights of a walk (NOTES 3). Not 0.02 beside 0.6."""
     policy, embedded, obs = model(), model(identity="embedding"), observation(200)
-    obs = obs._replace(heights=-2 + 0.3 * obs.heights)
+    obs = obs._replace(heights=0.6 + 0.5 * obs.heights + 0.8 * torch.randn(200, 1, 1))
     patches = policy.tokens(obs, {})[:, 5:] - policy.patch_position
     legs = embedded.tokens(obs, {})[:, :4] - embedded.leg_position
     pairs = [(policy.patch_position, patches), (policy.dropped_position, patches)]
