@@ -191,7 +191,8 @@ def train(rank: int, args, sync: str) -> None:
                 checkpoint.save_policy(content, args.out / f"policy-{steps / 1e6:.1f}M.pt")
             learning_curve(args.out / "progress.csv", args.out / "progress.png")
 
-    progress = Progress(args.out / "progress.csv", iteration, steps, ends[-1])
+    if rank == 0:
+        progress = Progress(args.out / "progress.csv", iteration, steps, ends[-1])
     saved_at, stop = time.monotonic(), False
     while steps < ends[-1] and not stop:
         if steps >= ends[run.number + 1]:
