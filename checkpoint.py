@@ -1,7 +1,8 @@
 """Policies and runs as files: saved whole or not at all, and read without running what is inside.
 
 Two kinds, both of torch.save, both dictionaries of plain values and tensors:
-    policy.pt      `CARD` and the weights, matrices in half precision: 1 MB, to show and give away
+    policy.pt      `CARD`, the weights, matrices in half precision, and the learning curve (n,
+                   len(CURVE)): 1 MB, to show and give away
     checkpoint.pt  the same in full, and all else that `train.py --resume` needs to go on
 """
 
@@ -17,6 +18,7 @@ from robots import ROBOTS
 
 FORMAT = 2  # 1 was before leg frames
 CARD = ("robot", "task", "policy", "scan", "seed", "steps", "stages", "init")  # what it is for
+CURVE = ("steps", "episode_return", "speed", "commanded_speed", "fall_share")  # how it learned
 
 
 class CheckpointError(ValueError):
@@ -40,7 +42,7 @@ def save(content: dict, path: Path) -> None:
 def save_policy(content: dict, path: Path) -> None:
     """The part of a checkpoint.pt that a policy.pt is."""
     halves = {name: x.half() if x.dim() > 1 else x for name, x in content["weights"].items()}
-    save({key: content[key] for key in CARD} | {"weights": halves}, path)
+    save({key: content[key] for key in (*CARD, "curve")} | {"weights": halves}, path)
 
 
 def load(path: str | Path) -> dict:
@@ -70,7 +72,7 @@ def loaded(path: str | Path):
 def load_policy(path: str | Path, robot: str | None = None) -> tuple[torch.nn.Module, dict]:
     """The policy in the file (of this robot, if one is given), ready to act, and its card."""
     with loaded(path) as content:
-        card = {key: content[key] for key in CARD}
+        card = {key: content[key] for key in (*CARD, "curve")}
         name, task, scan = card["policy"], TASKS[card["task"]], card["scan"]
         policy = make_policy(name, ROBOTS[card["robot"]], task, scan)
         policy.load_state_dict(content["weights"])  # as float32, whatever the file has

@@ -2,6 +2,7 @@
 
     python evaluate.py stiffness    # every shipped checkpoint (or --checkpoints FILE ...)
     python evaluate.py gaits --methods rolt --episodes 8 --seconds 10 --out /tmp/quick
+    python evaluate.py claims       # verdicts on the paper's claims, from the CSV files (claims.py)
     python evaluate.py watch        # a policy to look at while it walks (watch.py)
 
 Each prints a table and writes EXPERIMENT.csv (mostly a row an episode) and EXPERIMENT.png to --out.
@@ -23,6 +24,7 @@ import plots
 import watch
 from baselines import METHODS
 from checkpoint import load_policy
+from claims import USED, by_seed, claims, compare, mean_and_interval, trained
 from env import CONTROL_DT, LocomotionEnv
 from faults import HEALTHY, REAL_WORLD, TASKS, first_task
 from noise import HEIGHT_SCALE, NoisyScan
@@ -30,7 +32,7 @@ from ppo import Critic, PPOConfig, RolloutBuffer, collect, to_tensors
 from robots import ROBOTS
 from rolt import GRID, NUM_PATCHES, PATCH, ROLT, Observation
 from terrain import Terrain, rise
-from walk import by_seed, duty, mean_and_interval, origin, take_a_walk, walk_cases, write_csv
+from walk import duty, origin, take_a_walk, walk_cases, write_csv
 
 STAIRS_LEVEL = 0  # of the noise tests, ours: steps of 5 cm, the easiest of legged_gym
 NOISE_SCALES = (0.0, 0.05, 0.1, 0.15, 0.2, 0.3, 0.4)  # m, ours
@@ -38,27 +40,35 @@ GATE = 0.1  # standard deviations of an action, ours: less is no mechanism
 WALKED = {"distance_m": "distance walked [m]", "fell": "share of falls", "success": "success"}
 
 
-def report(args, rows: list[dict], columns: dict[str, str], title: str, marks={}, x="") -> None:
+def report(args, rows: list[dict], columns: dict[str, str], title: str, seen=(), x="") -> None:
     """Writes EXPERIMENT.csv and .png, prints a table of each of the columns {column: what}: mean
-    over seeds of the mean over episodes (95 % interval). marks: {case: remark}; x: see `chart`."""
+    over seeds of the mean over episodes (95 % interval). seen: cases that were trained on, where
+    who does not walk is not trained; x: see `chart`."""
+    for row in rows:
+        row["seen"] = int(row["case"] in seen)
     path = args.out / args.experiment
     write_csv(path.with_suffix(".csv"), rows)
     methods, cases = ([*dict.fromkeys(row[key] for row in rows)] for key in ("method", "case"))
-    labels = [case + marks.get(case, "") for case in cases]
+    unused = {(row["method"], row["case"]) for row in rows if float(row.get("leg_duty", 1)) < USED}
+    heads = {m: m if trained(rows, m) else f"{m}, not trained" for m in methods}
+    labels = [f"{case} (seen)" if case in seen and not x else case for case in cases]
     panels = {}
     for column, what in columns.items():
         print(f"\n{title}: {what}\n")
-        print("|", *(f"| {method}" for method in methods), "|")
+        print("|", *(f"| {head}" for head in heads.values()), "|")
         print("|---" * (len(methods) + 1) + "|")
-        panels[what] = {method: [] for method in methods}
+        panels[what] = {head: [] for head in heads.values()}
         for case, label in zip(cases, labels):
             line = f"| {label} |"
-            for method in methods:
-                values = by_seed(rows, column, method=method, case=case)
-                mean, low, high = mean_and_interval(values)
-                panels[what][method].append((mean, low, high, values.mean(axis=1)))
-                line += f" {mean:.2f}" + f" ({low:.2f} to {high:.2f})" * (low < high) + " |"
+            for method, head in heads.items():
+                seeds = by_seed(rows, column, method=method, case=case)
+                mean, low, high = mean_and_interval(seeds) if seeds else (np.nan,) * 3
+                panels[what][head].append((mean, low, high, [x.mean() for x in seeds]))
+                line += f" {mean:.2f}" + f" ({low:.2f} to {high:.2f})" * (low < high)
+                line += " * |" if (method, case) in unused else " |"
             print(line)
+    if unused:
+        print("\n* the leg is hardly used when healthy by one of the seeds or more: no test")
     plots.chart(panels, labels, path.with_suffix(".png"), title, x)
 
 
@@ -67,9 +77,14 @@ def fault_test(args, policies, name: str, case_name) -> None:
     task = TASKS[args.task]
     faults = *task.seen, *task.unseen
     cases = {case_name(f.split(":")[1]) if f.count(":") == 1 and "_" in f else f: f for f in faults}
-    marks = {case: " (seen)" for case, fault in cases.items() if fault in task.seen}
+    seen = [case for case, fault in cases.items() if fault in task.seen]
     rows = walk_cases(args, policies, cases, speed=0.75)
-    report(args, rows, WALKED, f"{name} test: {args.robot}, 0.75 m/s, {args.seconds:g} s", marks)
+    title = f"{name} test: {args.robot}, 0.75 m/s, {args.seconds:g} s"
+    report(args, rows, WALKED, title, seen)
+    robot, unseen = ROBOTS[args.robot], [case for case in cases if case not in seen]
+    behind = {leg for leg, mount in zip(robot.legs, robot.mounts) if mount[0] < 0}
+    hind = [case for case in unseen if cases[case].split(":")[1][:2] in behind]
+    compare(rows, {"all unseen": unseen, "unseen hind legs": hind})
 
 
 def stiffness(args, policies) -> None:
@@ -92,17 +107,17 @@ def real_world(args, policies) -> None:
     for case, fault in REAL_WORLD.items():  # one by one: only who needs a box or wheels has them
         rows += walk_cases(args, policies, {case: fault}, speed=0.75)
     title = f"Real-world test, simulated: {args.robot}, 0.75 m/s, {args.seconds:g} s"
-    report(args, rows, WALKED, title)
+    report(args, rows, WALKED, title, seen=["healthy"])
 
 
-def on_stairs(args, policies, cases: dict, name: str, x="") -> None:
+def on_stairs(args, policies, cases: dict, name: str, seen=(), x="") -> None:
     """Healthy, 0.5 m/s, over stairs. cases: {case: (level, noise)}."""
     rows = []
     for case, (level, noise) in cases.items():
         course = {"terrain": Terrain(("stairs",), (level,) * 3), "noise": noise}
         rows += walk_cases(args, policies, {case: HEALTHY}, 0.5, **course)
     columns = {"episode_return": "return of an episode"} | WALKED
-    report(args, rows, columns, f"{name}: {args.robot}, 0.5 m/s, {args.seconds:g} s", x=x)
+    report(args, rows, columns, f"{name}: {args.robot}, 0.5 m/s, {args.seconds:g} s", seen, x)
 
 
 def stairs(args, policies) -> None:
@@ -129,7 +144,7 @@ def high_frequency(args, policies) -> None:
 def noise_test(args, policies, kind: str, name: str, x: str) -> None:
     """Against the scale of the noise, on stairs of STAIRS_LEVEL."""
     cases = {f"{scale:g}": (STAIRS_LEVEL, f"{kind}:{scale}") for scale in NOISE_SCALES}
-    on_stairs(args, policies, cases, f"{name}, steps of {100 * rise(STAIRS_LEVEL):.1f} cm", x)
+    on_stairs(args, policies, cases, f"{name}, steps of {100 * rise(STAIRS_LEVEL):.1f} cm", "0", x)
 
 
 def attention(args, policies) -> None:
@@ -185,6 +200,15 @@ def gaits(args, policies) -> None:
     write_csv(args.out / "gaits.csv", rows)
     picture, name = args.out / "gaits.png", f"Gaits: {args.robot}, feet on the ground, 1 s"
     plots.gait_diagrams(panels, legs, CONTROL_DT, len(policies), picture, name)
+
+
+def curves(args, policies) -> None:
+    """Not in the paper: how each method learned, in training (mean over seeds, their range)."""
+    methods = {}
+    for _, card in policies.values():
+        if len(card["curve"]):
+            methods.setdefault(card["policy"], []).append(card["curve"].numpy())
+    plots.learning_curves(methods, args.out / "curves.png", f"{args.robot}, {args.task}")
 
 
 def mechanisms(args, policies) -> None:
@@ -284,6 +308,7 @@ EXPERIMENTS = {
     "high_frequency": (high_frequency, "terrain", "a1", METHODS),
     "attention": (attention, "terrain", "a1", ("rolt", "no-pe-drop", "no-feature-drop")),
     "gaits": (gaits, None, "a1", METHODS),
+    "curves": (curves, None, "a1", METHODS),
     "mechanisms": (mechanisms, None, "a1", METHODS),
     "dropout_ratio": (dropout_ratio, "stiffness", "a1", ("rolt",)),
 }
@@ -317,7 +342,7 @@ def main(argv: list[str] | None = None) -> None:
     plain = {"usage": argparse.SUPPRESS, "formatter_class": argparse.RawDescriptionHelpFormatter}
     parser = argparse.ArgumentParser(description=__doc__, **plain)
     add = parser.add_argument
-    add("experiment", choices=EXPERIMENTS)
+    add("experiment", choices=[*EXPERIMENTS, "claims"])
     add("--robot", choices=ROBOTS, help="default: the one that the test is for")
     which = parser.add_mutually_exclusive_group().add_argument
     which("--methods", nargs="+", choices=METHODS, help="of the shipped policies (default: all)")
@@ -328,6 +353,8 @@ def main(argv: list[str] | None = None) -> None:
     add("--threads", type=int, default=os.cpu_count(), help="cores to use (default: all)")
     add("--out", type=Path, default=Path("results"), help="folder of the CSV file and the picture")
     args = parser.parse_args(argv)
+    if args.experiment == "claims":
+        return claims(args.out)
     function, task, robot, methods = EXPERIMENTS[args.experiment]
     seconds = 10.0 if args.experiment in ("real_world", "gaits") else 20.0
     args.robot, args.seconds = args.robot or robot, args.seconds or seconds
@@ -340,7 +367,7 @@ def main(argv: list[str] | None = None) -> None:
         torch.set_num_threads(args.threads)
         with torch.no_grad():
             function(args, policies)
-        print(f"\nwritten: {args.out / args.experiment}.csv and .png")
+        print(f"\nwritten: {args.out / args.experiment}.*")
     except (ValueError, OSError, ArithmeticError, MemoryError) as error:
         sys.exit(f"error: {error}")
 

@@ -38,6 +38,25 @@ def learning_curve(progress: Path, picture: Path) -> None:
     figure.savefig(picture)
 
 
+def learning_curves(methods: dict[str, list], picture: Path, title: str) -> None:
+    """methods: {name: a (n, len(CURVE)) array a seed}. A line is the mean of the seeds, a band what
+    lies between the lowest and the highest."""
+    figure, axes = grid_of_axes(1, 3, 4, 3, title)
+    names = "return of an episode", "speed / commanded speed", "share of episodes that end in a fall"
+    for axis, name in zip(axes[0], names):
+        axis.set(title=name, xlabel="env steps [million]")
+        axis.grid(alpha=0.3)
+    for method, seeds in methods.items():
+        length = min(map(len, seeds))
+        steps, returns, speed, command, falls = np.array([seed[:length] for seed in seeds]).T
+        for axis, values in zip(axes[0], (returns, speed / command, falls)):
+            axis.plot(steps[:, 0] / 1e6, values.mean(axis=1), lw=1.2, label=method)
+            axis.fill_between(steps[:, 0] / 1e6, values.min(axis=1), values.max(axis=1), alpha=0.2)
+    handles = axes[0, 0].get_legend_handles_labels()
+    figure.legend(*handles, loc="outside lower center", ncols=min(6, len(methods)))
+    figure.savefig(picture)
+
+
 def chart(panels: dict[str, dict], cases: list[str], picture: Path, title: str, x: str) -> None:
     """panels: {what: {method: (mean, low, high, seeds' means) of each case}}. A bar or, where the
     cases are numbers and x says of what, a curve a method, with its interval; a dot a seed."""

@@ -184,7 +184,7 @@ def train(rank: int, args, sync: str) -> None:
             content = options | {"steps": steps, "stages": lengths, "options": options}
             content |= {name: part.state_dict() for name, part in run.parts.items()}
             content |= {"stage": run.number, "iteration": iteration, "processes": everyone}
-            content["torch"] = torch.get_rng_state()
+            content["torch"], content["curve"] = torch.get_rng_state(), progress.curve()
             checkpoint.save(content, args.out / "checkpoint.pt")
             checkpoint.save_policy(content, args.out / "policy.pt")
             if snapshot:  # to see how a policy grew
@@ -257,6 +257,11 @@ class Progress:
             with open(path, newline="") as file:
                 self.rows = [x for x in csv.DictReader(file) if int(x["iteration"]) <= iteration]
             write_csv(path, self.rows)
+
+    def curve(self) -> torch.Tensor:
+        """(n, len(CURVE)), every tenth iteration."""
+        rows = [[float(row[name]) for name in checkpoint.CURVE] for row in self.rows[9::10]]
+        return torch.tensor(rows).reshape(-1, len(checkpoint.CURVE))
 
     def log(self, row: dict) -> None:
         """Adds to the row what the episodes of the last iterations were like, and writes it."""

@@ -1,4 +1,4 @@
-"""One walk of a policy, what is measured of it, and what several seeds say together.
+"""One walk of a policy, and what is measured of it.
 
 Robots go straight on and unpushed; starts vary as in training. N robots, T steps of 20 ms, L legs.
 """
@@ -12,6 +12,7 @@ import numpy as np
 import torch
 
 from env import CONTROL_DT, EnvConfig, LocomotionEnv
+from faults import HEALTHY, harms_of
 from ppo import to_tensors
 
 WARM_UP = 2.0  # s after the start that do not count for a gait; ours: by then the robot walks
@@ -74,7 +75,7 @@ def take_a_walk(policy, robot, faults, speed, seconds, seed=0, threads=0, seen=N
     return Walk(env, poses, contacts, steps, distance, fall_time, returns, ~upright)
 
 
-def duty(walk: Walk, robots: range) -> np.ndarray:
+def duty(walk: Walk, robots: list[int]) -> np.ndarray:
     """(L,) share of the time that each foot was down, from WARM_UP to the first fall, mean over
     `robots`; above 0.5 in a walk, below in a run. NaN if that is too short for all of them."""
     steady = [walk.contacts[round(WARM_UP / CONTROL_DT) : walk.steps[i], i] for i in robots]
@@ -89,38 +90,27 @@ def origin(path: Path, card: dict) -> dict:
 
 def walk_cases(args, policies, cases: dict[str, str], speed: float, **sim) -> list[dict]:
     """Every policy on every case, `args.episodes` robots each: rows of the CSV file. Distance is as
-    walked; `share` is of the commanded distance, at most 1 (to run ahead is no success)."""
+    walked; `share` is of the commanded distance, at most 1 (to run ahead is no success). `leg_duty`
+    is of the harmed leg, the least used if several, in the healthy case (1 without one)."""
     labels = [(case, episode) for case in cases for episode in range(args.episodes)]
     faults = [cases[case] for case, _ in labels]
     how, rows = (speed, args.seconds, args.seed, args.threads), []
     for path, (policy, card) in policies.items():
         walk = take_a_walk(policy, args.robot, faults, *how, **sim)
+        healthy = [i for i, fault in enumerate(faults) if fault == HEALTHY]
+        duties = dict(zip(walk.env.robot.legs, duty(walk, healthy)))
         for i, (case, episode) in enumerate(labels):
+            used = [duties.get(harm.part[:2], 1.0) for harm in harms_of(faults[i]) if healthy]
             share, fell = min(1.0, walk.distance[i] / (speed * args.seconds)), walk.fell[i]
             rows.append(origin(path, card) | {
                 "case": case, "episode": episode, "fell": int(fell),
                 "success": int(share >= 0.5 and not fell), "distance_m": f"{walk.distance[i]:.4f}",
                 "share": f"{share:.4f}", "fall_time_s": f"{walk.fall_time[i]:.4f}",
+                "leg_duty": f"{min(used, default=1.0):.2f}",
                 "episode_return": f"{walk.returns[i]:.4f}",
             })  # fmt: skip
         print(f"  {card['policy']}, seed {card['seed']}: done", flush=True)
     return rows
-
-
-def by_seed(rows: list[dict], column: str, **where) -> np.ndarray:
-    """(seeds, episodes) of the rows where these columns have these values."""
-    rows = [row for row in rows if all(row[key] == value for key, value in where.items())]
-    seeds = dict.fromkeys(row["seed"] for row in rows)
-    values = [[float(row[column]) for row in rows if row["seed"] == seed] for seed in seeds]
-    return np.array(values or [[np.nan]])
-
-
-def mean_and_interval(values: np.ndarray) -> tuple[float, float, float]:
-    """Of (seeds, episodes) the mean and its 95 %, by a bootstrap of seeds and of their episodes."""
-    rng, (S, E) = np.random.default_rng(0), values.shape
-    seeds, episodes = rng.integers(S, size=(2000, S, 1)), rng.integers(E, size=(2000, S, E))
-    low, high = np.percentile(values[seeds, episodes].mean(axis=(1, 2)), (2.5, 97.5))
-    return float(values.mean()), float(low), float(high)
 
 
 def write_csv(path: Path, rows: list[dict], mode: str = "w") -> None:

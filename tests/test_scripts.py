@@ -59,7 +59,7 @@ def interrupted(words):
     while running.poll() is None and not (out / "checkpoint.pt").exists():
         time.sleep(0.05)
     running.send_signal(signal.SIGTERM)
-    said, _ = running.communicate(timeout=60)
+    said, _ = running.communicate(timeout=300)
     assert running.returncode == 0 and "stopped at" in said, said
 
 

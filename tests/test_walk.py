@@ -88,24 +88,6 @@ def test_rows_name_their_case_and_overspeed_is_no_success(policy):
     assert float(fast[1]["distance_m"]) == 2.0
 
 
-def test_a_cell_is_the_mean_over_seeds_of_the_mean_over_episodes():
-    """Seed 0: 1 and 3; seed 1: 7 and 9. 2 and 8, hence 5; a drawn mean of seeds is 1 to 9."""
-    walked = [(0, 1), (0, 3), (1, 7), (1, 9)]
-    rows = [{"method": "rolt", "case": "FR", "seed": seed, "distance_m": x} for seed, x in walked]
-    others = [row | {"method": "mlp", "distance_m": 100} for row in rows]
-    values = walk.by_seed(others + rows, "distance_m", method="rolt", case="FR")
-    assert values.tolist() == [[1, 3], [7, 9]]
-    mean, low, high = walk.mean_and_interval(values)
-    assert mean == 5 and 1 <= low < 2 < 8 < high <= 9  # both seeds the same one: 1 in 4 draws
-    assert np.isnan(walk.by_seed(rows, "distance_m", case="RL")).all()
-
-
-def test_the_interval_of_seeds_is_a_binomials():
-    """Two of five seeds reach 1: of five drawn, 0 to 4 do in 95 %."""
-    seeds = np.repeat(np.array([[0.0], [0], [0], [1], [1]]), 4, axis=1)
-    assert walk.mean_and_interval(seeds) == pytest.approx((0.4, 0.0, 0.8))
-
-
 def pattern(*feet: str) -> np.ndarray:
     """(T, L) from one word a foot, # on the ground and . in the air."""
     return np.array([[mark == "#" for mark in foot] for foot in feet]).T

@@ -1,0 +1,201 @@
+"""What several seeds say together, and a verdict on each claim of the paper.
+
+    python evaluate.py claims    # from the CSV files that the tests have left in --out
+
+The unit is the seed: it stands for a training, an episode only for a start. Intervals are of 95 %,
+by a bootstrap of seeds and of episodes within each. Comparisons over many cases are rliable's
+(Agarwal et al. 2021): interquartile mean and probability of improvement. `rows` are those of a CSV
+file (walk.py); S seeds, C cases.
+"""
+
+import csv
+import math
+from itertools import combinations
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+DRAWS = 2000
+SEEDS = 3  # ours: fewer give no verdict
+USED = 0.1  # share of the time down when healthy; below, a leg's fault tests nothing
+TRAINED, FALLS = 0.8, 0.05  # of the command, of episodes: worse on what it has seen = not trained
+
+
+def by_seed(rows: list[dict], column: str, **where) -> list[np.ndarray]:
+    """The column's numbers, an array a seed, of the rows where other columns have these values."""
+    seeds = {}
+    for row in rows:
+        if all(row[key] == value for key, value in where.items()):
+            seeds.setdefault(row["seed"], []).append(float(row[column]))
+    return [np.array(numbers) for numbers in seeds.values()]
+
+
+def bootstrap(seeds: list[np.ndarray], rng: np.random.Generator) -> np.ndarray:
+    """(DRAWS,) means of S seeds drawn with replacement, each of as many episodes as it has."""
+    S = len(seeds)
+    means = [rng.choice(x, (DRAWS, S, len(x))).mean(axis=2) for x in seeds]  # S times (DRAWS, S)
+    drawn = rng.integers(S, size=(1, DRAWS, S))
+    return np.take_along_axis(np.stack(means), drawn, axis=0)[0].mean(axis=1)
+
+
+def interval(draws: np.ndarray) -> tuple[float, float]:
+    low, high = np.percentile(draws, (2.5, 97.5))
+    return float(low), float(high)
+
+
+def mean_and_interval(seeds: list[np.ndarray]) -> tuple[float, float, float]:
+    """Mean over seeds of the mean over episodes, and its 95 %."""
+    mean = float(np.mean([x.mean() for x in seeds]))
+    return mean, *interval(bootstrap(seeds, np.random.default_rng(0)))
+
+
+def interquartile_mean(scores: np.ndarray) -> tuple[float, float, float]:
+    """Of (S, C) the mean of the middle half, and its 95 %: seeds drawn for each case by itself."""
+    (S, C), rng = scores.shape, np.random.default_rng(0)
+    drawn = np.take_along_axis(scores[None], rng.integers(S, size=(DRAWS, S, C)), axis=1)
+    flat = np.sort(np.concatenate([scores[None], drawn]).reshape(DRAWS + 1, -1), axis=1)
+    cut = flat.shape[1] // 4
+    means = flat[:, cut : flat.shape[1] - cut].mean(axis=1)
+    return float(means[0]), *interval(means[1:])
+
+
+def probability_better(a: np.ndarray, b: np.ndarray) -> float:
+    """That a seed of a, (S, C), scores above one of b in the same case; half for a tie."""
+    return float(((a[:, None] > b) + 0.5 * (a[:, None] == b)).mean())
+
+
+def permutation_p(a: np.ndarray, b: np.ndarray) -> float:
+    """Exact and two-sided, of the difference of means of (S,) and (S',): the share of all ways to
+    deal out the seeds that give as large a one."""
+    both = np.concatenate([a, b])
+    chosen = np.array(list(combinations(range(len(both)), len(a))))
+    ours, total = both[chosen].sum(axis=1), both.sum()
+    gaps = np.abs(ours / len(a) - (total - ours) / len(b))
+    return float((gaps >= abs(a.mean() - b.mean()) - 1e-12).mean())
+
+
+def trained(rows: list[dict], method: str) -> bool:
+    """Does the method walk on what it has seen?"""
+    seen = {row["case"] for row in rows if int(row["seen"])}
+    for case in seen:
+        share, fell = (by_seed(rows, x, method=method, case=case) for x in ("share", "fell"))
+        if np.mean(share) < TRAINED or np.mean(fell) > FALLS:
+            return False
+    return True
+
+
+def scores(rows: list[dict], method: str, cases: list[str], column="share") -> np.ndarray:
+    """(S, C), each the mean over episodes."""
+    values = [by_seed(rows, column, method=method, case=case) for case in cases]
+    return np.array([[x.mean() for x in seeds] for seeds in values]).T
+
+
+def compare(rows: list[dict], groups: dict[str, list[str]], best: str = "rolt") -> None:
+    """Prints a table over groups of cases: shares of the commanded distance."""
+    methods = [*dict.fromkeys(row["method"] for row in rows)]
+    for name, cases in groups.items():
+        print(f"\n| {name} | IQM of the share walked | {best} is better | p |\n|---|---|---|---|")
+        ours = scores(rows, best, cases) if best in methods else None
+        for method in methods:
+            theirs = scores(rows, method, cases)
+            iqm, low, high = interquartile_mean(theirs)
+            line = f"| {method} | {iqm:.2f}" + f" ({low:.2f} to {high:.2f})" * (low < high)
+            if ours is None or method == best:
+                print(line, "| | |")
+                continue
+            p = permutation_p(ours.mean(axis=1), theirs.mean(axis=1))
+            print(line, f"| {probability_better(ours, theirs):.0%} | {p:.3f} |")
+
+
+class Claim(NamedTuple):
+    """ROLT's measure over these cases is above a number or above each of these methods'."""
+
+    text: str
+    test: str  # whose CSV file
+    measure: str
+    against: tuple[str | float, ...]
+    cases: tuple[str, ...] = ()  # () = all unseen
+
+
+PE, FEATURE = "no-pe-drop", "no-feature-drop"
+UNSHARED = ("mlp", "rma", "roam")
+NOISE = (PE, FEATURE, "mlp", "roll-drop", "rma")
+CLAIMS = (
+    Claim("walks with hind legs that it never saw limping", "stiffness", "success", (0.8,),
+          ("RR", "RL")),
+    Claim("... better than without shared legs", "stiffness", "success", UNSHARED, ("RR", "RL")),
+    Claim("... or with a position for each leg", "stiffness", "success", ("module-pe",),
+          ("RR", "RL")),
+    Claim("stays up with motors it never saw dead", "damage", "upright", (0.95,)),
+    Claim("... and gets on", "damage", "success", (0.8, "module-pe", *UNSHARED)),
+    Claim("displaced patches cost it the least", "low_frequency", "kept", NOISE),
+    Claim("so does noise on every point", "high_frequency", "kept", NOISE),
+    *(Claim(f"Go1, {case}: further than RMA", "real_world", "share", ("rma",), (case,))
+      for case in ("weaken", "box", "skates")),
+)  # fmt: skip
+
+
+def measured(rows: list[dict], method: str, claim: Claim) -> list[np.ndarray]:
+    """The claim's measure of each seed's episodes, where the leg is one that the method uses.
+    upright: no fall; kept: the share walked, over the seed's own without noise."""
+    def chosen(row: dict) -> bool:
+        wanted = row["case"] in claim.cases if claim.cases else not int(row["seen"])
+        return row["method"] == method and wanted and float(row["leg_duty"]) >= USED
+
+    rows, whole = [row for row in rows if chosen(row)], rows
+    if claim.measure == "upright":
+        return [1 - fell for fell in by_seed(rows, "fell")]
+    if claim.measure == "kept":
+        clean = [row for row in whole if row["method"] == method and int(row["seen"])]
+        pairs = zip(by_seed(rows, "share"), by_seed(clean, "share"))
+        return [noisy / clean.mean() for noisy, clean in pairs]
+    return by_seed(rows, claim.measure)
+
+
+def judge(ours: list[np.ndarray], theirs: list[np.ndarray]) -> tuple[str, str, str]:
+    """The difference with its interval, the verdict, and how many seeds would decide (if the
+    difference and the spread of the seeds stay what they are)."""
+    rng = np.random.default_rng(0)
+    low, high = interval(bootstrap(ours, rng) - bootstrap(theirs, rng))
+    a, b = (np.array([x.mean() for x in seeds]) for seeds in (ours, theirs))
+    gap, fixed = a.mean() - b.mean(), len(b) == 1 and len(theirs[0]) == 1  # against a number
+    enough = min(len(a), math.inf if fixed else len(b)) >= SEEDS
+    verdict = "undecided"
+    if enough and not low <= 0 <= high:
+        verdict = "shows" if gap > 0 else "does not"
+    needed = f"{SEEDS}"
+    if enough:
+        spread = a.var(ddof=1) + (0 if fixed else b.var(ddof=1))
+        needed = f"{max(SEEDS, math.ceil(1.96**2 * spread / gap**2))}" if gap else "more"
+    words = f"{gap:+.2f} ({low:+.2f} to {high:+.2f})"
+    return words, verdict, needed if verdict == "undecided" else "-"
+
+
+def claims(folder: Path) -> None:
+    """Prints the table of claims."""
+    columns = "ROLT ...", "test", "ROLT", "than", "difference", "seeds", "verdict", "would decide"
+    print(f"| {' | '.join(columns)} |\n{'|---' * len(columns)}|")
+    for claim in CLAIMS:
+        path = folder / f"{claim.test}.csv"
+        rows = []
+        if path.exists():
+            with open(path, newline="") as file:
+                rows = list(csv.DictReader(file))
+        there = {row["method"] for row in rows}
+        for other in claim.against:
+            line = f"| {claim.text} | {claim.test}, {claim.measure} "
+            number = isinstance(other, float)
+            methods = ["rolt"] if number else ["rolt", other]
+            why = [f"{m}: no data" for m in methods if m not in there]
+            why = why or [f"{m}: not trained" for m in methods if not trained(rows, m)]
+            if why:
+                print(line + f"| | {other} | | | {', '.join(why)} | - |")
+                continue
+            ours = measured(rows, "rolt", claim)
+            theirs = [np.array([other])] if number else measured(rows, other, claim)
+            mean, low, high = mean_and_interval(ours)
+            gap, verdict, needed = judge(ours, theirs)
+            seeds = f"{len(ours)}" if number else f"{len(ours)}, {len(theirs)}"
+            line += f"| {mean:.2f} ({low:.2f} to {high:.2f}) | {other} | {gap} | {seeds} "
+            print(line + f"| {verdict} | {needed} |")
