@@ -132,7 +132,7 @@ class RMA(Policy):
                 nn.Conv2d(8, 16, 3, stride=2, padding=1), nn.ELU(), nn.Flatten(),
                 nn.Linear(self.num_heights, features), nn.ELU(),
             )  # fmt: skip
-        privileged = 2 * self.num_actions + 1 + other_harms(task.seen).shape[1]
+        privileged = 2 * self.num_actions + 1 + len(other_harms(task.seen))
         self.encoder = network(privileged, 256, 128, LATENT)  # 256, 128: Kumar et al.
         hidden = network(HISTORY * self.frame + features + LATENT, *HIDDEN)
         self.base = nn.Sequential(hidden, nn.ELU(), Decoder(HIDDEN[-1], self.num_actions))

@@ -38,16 +38,14 @@ import numpy as np
 import torch
 from mujoco.batch import Batch
 
-from faults import HEALTHY, FaultWriter, other_harms, props
+from faults import HEALTHY, FaultWriter, fault_now, props
 from noise import NoisyScan
 from rewards import FALL, total_reward
-from robots import PHYSICS_DT, ROBOTS, Robot, build_model
+from robots import CONTROL_DT, ROBOTS, SUBSTEPS, Robot, build_model
 from rolt import HISTORY, Observation
 from terrain import TILE, Terrain
 
 mujoco.set_mju_user_warning(lambda message: None)  # counted in `_diverged`, not logged
-SUBSTEPS = 4  # legged_gym: 50 Hz control
-CONTROL_DT = SUBSTEPS * PHYSICS_DT  # s
 LONG_HISTORY = 50  # steps that RMA's adaptation reads (Kumar et al. 2021)
 JOINT_SCALE = np.array([[4.0], [0.2], [1.0]])  # angle, velocity, action; ours (NOTES 2)
 TRUNK_SCALE = np.repeat((2.0, 2.0, 1.0, 5.0), 3)  # command, velocities, gravity; ours, likewise
@@ -59,7 +57,7 @@ MAX_TILT = np.cos(np.deg2rad(60))  # ours: past it none gets up again; legged_gy
 EXTRAS = ("privileged", "heights", "past", "situation")
 SAVED = (
     "action", "last_action", "history", "command", "heading", "air_time", "age", "first_age",
-    "command_age", "episode_return", "fault_index", "_last_contact", "row", "start",
+    "command_age", "episode_return", "fault_index", "episode", "_last_contact", "row", "start",
 )  # fmt: skip
 
 
@@ -109,12 +107,12 @@ class LocomotionEnv:
         self.terrain, self.scan = terrain, NoisyScan(num_envs, terrain, noise, seed)
 
         self._fault_odds, self.faults = zip(*faults)
-        self._other_harms = other_harms(self.faults)  # (faults, M)
         self.model = model = build_model(robot, terrain, **props(self.faults))
         self.world = world = Batch(model, nsim=num_envs, nthread=num_threads, persistent=True)
         self._qpos, self._qvel, self._ctrl = map(world.bind, ("qpos", "qvel", "ctrl"))
         self._torque, self._contacts = map(world.bind, ("actuator_force", "sensordata"))
-        self._friction, self.fault_writer = world.expand("geom_friction"), FaultWriter(robot, world)
+        self._friction = world.expand("geom_friction")
+        self.fault_writer = FaultWriter(robot, world, self.faults)
         self._rotation = world.bind("xmat")[:, model.body("trunk").id]
         self._geoms = model.sensor_objid  # the robot's own: 0 the trunk, then each leg's
         self._foot_sensors = feet = [model.sensor(f"contact_{leg}_foot").id for leg in robot.legs]
@@ -129,7 +127,9 @@ class LocomotionEnv:
         self._joint_sign = np.where(left[:, None] & turned, -1.0, 1.0)  # (L, J)
         self._trunk_sign = np.where(left[:, None], MIRROR, 1.0)  # (L, 12)
 
-        self._pinned, self.fault_index = False, np.zeros(num_envs, dtype=int)  # in `faults`
+        self._pinned, self._luck = False, tuple(np.atleast_1d(seed))
+        self.fault_index, self.episode = np.zeros((2, num_envs), dtype=int)  # in `faults`; a count
+        self.fault_now = [HEALTHY] * num_envs  # without the words whose time it is not
         shape = (num_envs, self.num_legs, self.num_joints)
         memory = LONG_HISTORY if "past" in extras else HISTORY
         self.history = np.zeros((*shape[:2], memory, 3 * self.num_joints + 12), dtype=np.float32)
@@ -145,7 +145,7 @@ class LocomotionEnv:
     def pin_faults(self, faults: list[str]) -> None:
         """Robot i has faults[i] in every episode from its next reset on, for tests."""
         self.faults, self.fault_index, self._pinned = list(faults), np.arange(self.num_envs), True
-        self._other_harms = other_harms(self.faults)
+        self.fault_writer.expect(faults)
 
     def reset(self, random_ages: bool = False) -> Observation:
         """Starts an episode on every robot. `random_ages`: their ends are spread (legged_gym)."""
@@ -179,6 +179,7 @@ class LocomotionEnv:
         self.last_action, self.action = self.action, np.clip(action, -MAX_ACTION, MAX_ACTION)
         target = self._default + self.robot.action_scale * self._joint_sign * self.action  # rad
         self._ctrl[:] = target.reshape(self._ctrl.shape)
+        self._strike(np.flatnonzero(self.fault_writer.timed[self.fault_index]))
         self.world.step(nstep=SUBSTEPS, stage=mujoco.mjtStage.mjSTAGE_VEL)
         self.age += 1
         self.command_age += 1
@@ -229,6 +230,7 @@ class LocomotionEnv:
         """All that the next step depends on but noise on the scan. Tensors: safe for torch.load."""
         arrays = {name: getattr(self, name) for name in SAVED}
         arrays |= {"world": self.world.state, "friction": self._friction}
+        arrays |= self.fault_writer.state_dict()
         tensors = {name: torch.tensor(array) for name, array in arrays.items()}  # copies
         return tensors | {"random": self.rng.bit_generator.state}
 
@@ -237,8 +239,8 @@ class LocomotionEnv:
         for name in SAVED:
             getattr(self, name)[...] = state[name]
         self.rng.bit_generator.state = state["random"]
-        for i, index in enumerate(self.fault_index):
-            self.fault_writer.write(self.faults[index], i)
+        self._strike(range(self.num_envs), anew=True, ago=1)  # what was so in the last step
+        self.fault_writer.load_state_dict(state)
         self._friction[...] = state["friction"]
         self.world.state[...] = state["world"]
         self.world.forward(stage=mujoco.mjtStage.mjSTAGE_VEL)
@@ -254,12 +256,17 @@ class LocomotionEnv:
         self._qvel[ids, :6] = self.rng.uniform(-config.start_speed, config.start_speed, size=(n, 6))
         friction = self.rng.uniform(*config.friction, size=(n, 1, 1))
         self._friction[np.ix_(ids, self._geoms, [0])] = friction
-        for i in ids:
-            self.fault_writer.write(self.faults[self.fault_index[i]], i)
+        self.episode[ids] += 1
+        self.age[ids] = self.first_age[ids] = 0
+        self._strike(ids, anew=True)
         locked = self.world.bind("eq_active")[ids] > 0
         limits = self.world.expand("jnt_range")[ids][:, self._joints]
         pose = np.clip(pose.reshape(n, -1), limits[:, :, 0], limits[:, :, 1])
         self._qpos[ids[:, None], self._angle_at] = np.where(locked, self._default.reshape(-1), pose)
+        if self.model.nhistory:  # what late motors have been asked until now: the default pose
+            samples = self.model.actuator_history[0, 0]
+            memory = self.world.bind("history").reshape(self.num_envs, self.num_actions, -1)
+            memory[ids, :, -samples:] = self._default.reshape(-1, 1)
         if self.terrain:
             self.start[ids] = TILE * np.stack([self.row[ids], self.column[ids]], axis=1)
             self.start[ids, 1] += self.rng.uniform(-1, 1, size=n)  # m to the side, legged_gym
@@ -268,12 +275,22 @@ class LocomotionEnv:
         self.world.forward(ids, stage=mujoco.mjtStage.mjSTAGE_VEL)
 
         self.action[ids] = self.last_action[ids] = self.air_time[ids] = self._last_contact[ids] = 0
-        self.age[ids] = self.first_age[ids] = self.episode_return[ids] = 0
+        self.episode_return[ids] = 0
         self._read_state()
         old = self.command_age[ids] >= round(config.command_seconds / CONTROL_DT)
         self._resample_commands(ids[old])
         self._steer()
         self.history[ids] = self._frame()[ids, :, None]  # as though it had always stood like this
+
+    def _strike(self, ids, anew: bool = False, ago: int = 0) -> None:
+        """Gives the robots `ids` what is wrong at this step, or was so `ago` steps before; anew:
+        even if it is what they have."""
+        for i in ids:
+            luck, age = (*self._luck, i, self.episode[i]), self.age[i] - self.first_age[i]
+            now = fault_now(self.faults[self.fault_index[i]], max(0, age - ago), luck)
+            if anew or now != self.fault_now[i]:
+                self.fault_writer.write(now, i, None if anew else self._qpos[i, self._angle_at])
+                self.fault_now[i] = now
 
     def _climb(self, ids: np.ndarray) -> None:
         """The terrain's curriculum, at the end of an episode."""
@@ -331,11 +348,15 @@ class LocomotionEnv:
 
     def _frame(self) -> np.ndarray:
         """(N, L, 21), the newest step of every leg's history."""
-        angle = self._joint_sign * self.joint_error
-        velocity = self._joint_sign * self.joint_velocity
-        joints = JOINT_SCALE * np.stack([angle, velocity, self.action], axis=2)  # (N, L, 3, J)
-        trunk = [self.command, self.linear_velocity, self.angular_velocity]
-        trunk = TRUNK_SCALE * np.concatenate([*trunk, self.gravity - (0, 0, -1)], axis=1)  # (N, 12)
+        seen = self.joint_error, self.joint_velocity
+        seen += self.linear_velocity, self.angular_velocity, self.gravity
+        if self.fault_writer.senses is not None:
+            seen = self.fault_writer.senses.read(*seen)
+        angle, velocity, linear, angular, gravity = seen
+        joints = self._joint_sign * angle, self._joint_sign * velocity, self.action
+        joints = JOINT_SCALE * np.stack(joints, axis=2)  # (N, L, 3, J)
+        trunk = np.concatenate([self.command, linear, angular, gravity - (0, 0, -1)], axis=1)
+        trunk = TRUNK_SCALE * trunk  # (N, 12)
         parts = joints.reshape(*self.action.shape[:2], -1), trunk[:, None] * self._trunk_sign
         return np.concatenate(parts, axis=2, dtype=np.float32)
 
@@ -344,5 +365,5 @@ class LocomotionEnv:
         locked = self.world.bind("eq_active")
         motors = self.world.expand("actuator_forcerange") / self.model.actuator_forcerange
         friction = self._friction[:, self._geoms[:1], 0]
-        parts = locked, motors[:, :, 1], friction, self._other_harms[self.fault_index]
+        parts = locked, motors[:, :, 1], friction, self.fault_writer.told
         return np.concatenate(parts, axis=1, dtype=np.float32)

@@ -2,7 +2,7 @@
 
     python evaluate.py stiffness    # every shipped checkpoint (or --checkpoints FILE ...)
     python evaluate.py gaits --methods rolt --episodes 8 --seconds 10 --out /tmp/quick
-    python evaluate.py claims       # verdicts on the paper's claims, from the CSV files (claims.py)
+    python evaluate.py claims       # verdicts on the paper's claims, from the CSV files (report.py)
     python evaluate.py watch        # a policy to look at while it walks (watch.py)
 
 Each prints a table and writes EXPERIMENT.csv (mostly a row an episode) and EXPERIMENT.png to --out.
@@ -20,15 +20,16 @@ from pathlib import Path
 import numpy as np
 import torch
 
+import beyond
 import plots
 import watch
 from baselines import METHODS
 from checkpoint import load_policy
-from claims import USED, by_seed, claims, compare, mean_and_interval, trained
 from env import CONTROL_DT, LocomotionEnv
 from faults import HEALTHY, REAL_WORLD, TASKS, first_task
 from noise import HEIGHT_SCALE, NoisyScan
 from ppo import Critic, PPOConfig, RolloutBuffer, collect, to_tensors
+from report import claims, compare, report
 from robots import ROBOTS
 from rolt import GRID, NUM_PATCHES, PATCH, ROLT, Observation
 from terrain import Terrain, rise
@@ -38,38 +39,6 @@ STAIRS_LEVEL = 0  # of the noise tests, ours: steps of 5 cm, the easiest of legg
 NOISE_SCALES = (0.0, 0.05, 0.1, 0.15, 0.2, 0.3, 0.4)  # m, ours
 GATE = 0.1  # standard deviations of an action, ours: less is no mechanism
 WALKED = {"distance_m": "distance walked [m]", "fell": "share of falls", "success": "success"}
-
-
-def report(args, rows: list[dict], columns: dict[str, str], title: str, seen=(), x="") -> None:
-    """Writes EXPERIMENT.csv and .png, prints a table of each of the columns {column: what}: mean
-    over seeds of the mean over episodes (95 % interval). seen: cases that were trained on, where
-    who does not walk is not trained; x: see `chart`."""
-    for row in rows:
-        row["seen"] = int(row["case"] in seen)
-    path = args.out / args.experiment
-    write_csv(path.with_suffix(".csv"), rows)
-    methods, cases = ([*dict.fromkeys(row[key] for row in rows)] for key in ("method", "case"))
-    unused = {(row["method"], row["case"]) for row in rows if float(row.get("leg_duty", 1)) < USED}
-    heads = {m: m if trained(rows, m) else f"{m}, not trained" for m in methods}
-    labels = [f"{case} (seen)" if case in seen and not x else case for case in cases]
-    panels = {}
-    for column, what in columns.items():
-        print(f"\n{title}: {what}\n")
-        print("|", *(f"| {head}" for head in heads.values()), "|")
-        print("|---" * (len(methods) + 1) + "|")
-        panels[what] = {head: [] for head in heads.values()}
-        for case, label in zip(cases, labels):
-            line = f"| {label} |"
-            for method, head in heads.items():
-                seeds = by_seed(rows, column, method=method, case=case)
-                mean, low, high = mean_and_interval(seeds) if seeds else (np.nan,) * 3
-                panels[what][head].append((mean, low, high, [x.mean() for x in seeds]))
-                line += f" {mean:.2f}" + f" ({low:.2f} to {high:.2f})" * (low < high)
-                line += " * |" if (method, case) in unused else " |"
-            print(line)
-    if unused:
-        print("\n* the leg is hardly used when healthy by one of the seeds or more: no test")
-    plots.chart(panels, labels, path.with_suffix(".png"), title, x)
 
 
 def fault_test(args, policies, name: str, case_name) -> None:
@@ -202,15 +171,6 @@ def gaits(args, policies) -> None:
     plots.gait_diagrams(panels, legs, CONTROL_DT, len(policies), picture, name)
 
 
-def curves(args, policies) -> None:
-    """Not in the paper: how each method learned, in training (mean over seeds, their range)."""
-    methods = {}
-    for _, card in policies.values():
-        if len(card["curve"]):
-            methods.setdefault(card["policy"], []).append(card["curve"].numpy())
-    plots.learning_curves(methods, args.out / "curves.png", f"{args.robot}, {args.task}")
-
-
 def mechanisms(args, policies) -> None:
     """Is what the claims rest on alive? How much a method's actions change in a healthy walk, in
     their standard deviations, when a part of it is disturbed: an ablation is worth comparing if it
@@ -308,7 +268,11 @@ EXPERIMENTS = {
     "high_frequency": (high_frequency, "terrain", "a1", METHODS),
     "attention": (attention, "terrain", "a1", ("rolt", "no-pe-drop", "no-feature-drop")),
     "gaits": (gaits, None, "a1", METHODS),
-    "curves": (curves, None, "a1", METHODS),
+    "curves": (beyond.curves, None, "a1", METHODS),
+    "growth": (beyond.growth, None, "a1", METHODS),
+    "sudden": (beyond.sudden, None, "a1", METHODS),
+    "matrix": (beyond.matrix, None, "a1", METHODS),
+    "senses": (beyond.senses, None, "a1", METHODS),
     "mechanisms": (mechanisms, None, "a1", METHODS),
     "dropout_ratio": (dropout_ratio, "stiffness", "a1", ("rolt",)),
 }
@@ -351,6 +315,7 @@ def main(argv: list[str] | None = None) -> None:
     add("--seconds", type=float, help="an episode (default: the paper's 20; real_world, gaits 10)")
     add("--seed", type=int, default=0, help="of the starts")
     add("--threads", type=int, default=os.cpu_count(), help="cores to use (default: all)")
+    add("--pairs", action="store_true", help="matrix: of pairs of legs, not of single joints")
     add("--out", type=Path, default=Path("results"), help="folder of the CSV file and the picture")
     args = parser.parse_args(argv)
     if args.experiment == "claims":

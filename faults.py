@@ -1,86 +1,154 @@
-"""Faults as data: what is wrong with one robot, and how it gets onto one simulation of many.
+"""Faults as data: what is wrong with one robot, from when on, and how one robot of many gets it.
 
 A fault is words, the same in code, options, tables and checkpoints, which add up with "+":
+    healthy           nothing
     lock:FR_calf      held at the default angle, motor off (stiffness: "we simply lock the calf")
     disable:FR_thigh  no torque but dry friction (damage: "we simply set the torque output to zero")
-    weaken:RL:0.5     half of the torque is left (real world; a part is a joint or a whole leg)
+    weaken:RL:0.5     half of the torque is left (real world; a part: a joint, a leg, or all)
     half-lock:RR_calf:-1.5    cannot turn up past -1.5 rad, as if tied with a string (real world:
                       "the calf joint angle can't be larger"; the hexapod's left legs turn down)
     tow:RR            the foot is tied to a box ("pull a box with one single hind right leg")
     skate:FL          the foot is a wheel that grips sideways ("roller skates are tied")
-    healthy           nothing
+and, beyond the paper, what is ours:
+    late:FR:0.02      motors answer 0.02 s later, at most 0.04 (in steps of the simulation, 5 ms)
+    payload:trunk:2   2 kg more, in the middle of the trunk (or of a link)
+    blow:trunk:5      a push of 5 N s to the left, -5 to the right, within one control step
+    freeze:FR_calf    angle and velocity read as they were when it began
+    bias:FR:0.2       the angles read 0.2 rad more
+    mute:FR           angle and velocity read as of one at rest in the default pose
+    imu:trunk:0.1     gravity and turning are sensed by an IMU that sits 0.1 rad nose down
+    odometry:trunk:0.5    half of the velocity is sensed; 0 = none
+The last five change what policies see, neither the physics nor the rewards. A word may say when, in
+seconds of the episode:
+    lock:FR_calf@5:12    from 5 s to 12 s, @5: from then on. A lock that strikes holds where it is.
+    lock:FR_calf@0.3/2   for 0.3 s of every 2 s, at a moment drawn anew each time
 
 `faulty_model` does to a MuJoCo model what the words say; `FaultWriter` copies what has changed
 onto chosen robots. So a new fault is an entry in KINDS and some plain MuJoCo in `faulty_model`.
 """
 
 import copy
+import math
 from dataclasses import dataclass
+from functools import cache
 from typing import NamedTuple
 
 import mujoco
 import numpy as np
 from mujoco.batch import MODEL_FIELDS, Batch
 
-from robots import TETHER, Robot
+from robots import CONTROL_DT, MAX_DELAY, TETHER, Robot
 from terrain import TRAINING_MAP, Terrain
 
-# kind: does a number follow the part?
-KINDS = {"lock": 0, "disable": 0, "weaken": 1, "half-lock": 1, "tow": 0, "skate": 0}
-MOTORS = ("lock", "disable", "weaken")
+# kind: between what must the number lie that follows the part? None: no number
+KINDS = {
+    "lock": None, "disable": None, "weaken": (0, 1), "half-lock": (-7, 7), "tow": None,
+    "skate": None, "late": (0, MAX_DELAY), "payload": (0, 50), "blow": (-100, 100), "freeze": None,
+    "bias": (-7, 7), "mute": None, "imu": (-1.5, 1.5), "odometry": (0, 2),
+}  # fmt: skip
+MOTORS = ("lock", "disable", "weaken")  # a critic reads these off the simulation
+SENSES = ("freeze", "bias", "mute", "imu", "odometry")
 HEALTHY = "healthy"
 
 
 class Harm(NamedTuple):
-    """One of a fault's words."""
+    """One of a fault's words. Steps are control steps of the episode."""
 
     kind: str  # of KINDS
-    part: str  # a joint or a leg
+    part: str  # a joint, a leg, a body
     size: float  # as said above; of a lock and a dead motor, too, the share of torque left
+    word: str  # all of it but for the time
+    first: int = 0  # step
+    last: float = math.inf  # step at which it has ended
+    period: int = 0  # steps; if any, it lasts `last` of each, from a moment that is drawn
+
+    def is_on(self, step: int, luck: tuple[int, ...]) -> bool:
+        """luck: what moments are drawn from."""
+        if not self.period:
+            return self.first <= step < self.last
+        turn, step = divmod(step, self.period)
+        start = np.random.default_rng((*luck, turn)).integers(self.period - self.last + 1)
+        return start <= step < start + self.last
 
 
-def harms_of(fault: str) -> list[Harm]:
+@cache
+def harms_of(fault: str) -> tuple[Harm, ...]:
     """What the words say. ValueError with what would be right."""
     harms = []
-    for word in fault.split("+"):
+    for text in fault.split("+"):
+        word, at, when = text.partition("@")
         kind, *rest = word.split(":")
         try:
-            if word != HEALTHY:
-                part, size = rest if KINDS[kind] else (*rest, 0)
-                harms.append(Harm(kind, part, float(size)))
-                if kind == "weaken" and not 0 <= float(size) <= 1:
-                    raise ValueError("a strength is from 0 to 1")
+            if text == HEALTHY:
+                continue
+            bounds = KINDS[kind]
+            part, size = rest if bounds else (*rest, 0)
+            if bounds and not bounds[0] <= float(size) <= bounds[1]:
+                raise ValueError(f"the number of {kind} is from {bounds[0]} to {bounds[1]}")
+            harms.append(Harm(kind, part, float(size), word, *_steps(when, kind) if at else ()))
         except (KeyError, ValueError) as error:  # no such kind, too few or too many, bad number
-            right = f"write healthy or {', '.join(KINDS)}, as in lock:FR_calf+weaken:RL:0.5"
-            raise ValueError(f"cannot read the fault {word!r} ({error}); {right}") from None
-    return harms
+            kinds = ", ".join(KINDS)
+            right = f"write healthy or {kinds}, as in lock:FR_calf+weaken:RL:0.5@5:12"
+            raise ValueError(f"cannot read the fault {text!r} ({error}); {right}") from None
+    return tuple(harms)
 
 
-def props(faults: list[str]) -> dict[str, list[str]]:
+def _steps(when: str, kind: str) -> tuple[int, float, int]:
+    """Harm's first, last and period of "5:12", "5:" or "0.3/2"."""
+    short = kind == "blow"  # a blow is over after one step
+    if "/" in when:
+        length, period = (round(float(x) / CONTROL_DT) for x in when.split("/"))
+        if not 1 <= length <= period:
+            raise ValueError("after @ a length / a period, not shorter, in s")
+        return 0, 1 if short else length, period
+    start, end = when.split(":")
+    first = round(float(start) / CONTROL_DT)
+    last = round(float(end) / CONTROL_DT) if end else math.inf
+    if not 0 <= first < last:
+        raise ValueError("after @ a start and a later end, in s, as in @5:12 or @5:")
+    return first, first + 1 if short else last, 0
+
+
+def fault_now(fault: str, step: int, luck: tuple[int, ...]) -> str:
+    """The words that hold in a control step of the episode, without their times."""
+    return "+".join(h.word for h in harms_of(fault) if h.is_on(step, luck)) or HEALTHY
+
+
+def props(faults: list[str]) -> dict[str, list[str] | bool]:
     """What `build_model` must add for robots with these faults."""
     harms = {harm for fault in faults for harm in harms_of(fault)}
-    towing = sorted(harm.part for harm in harms if harm.kind == "tow")
-    return {"towing": towing, "skating": sorted(h.part for h in harms if h.kind == "skate")}
+    legs = {kind: sorted({h.part for h in harms if h.kind == kind}) for kind in ("tow", "skate")}
+    late = any(harm.kind == "late" for harm in harms)
+    return {"towing": legs["tow"], "skating": legs["skate"], "late": late}
+
+
+def joints_of(robot: Robot, part: str) -> list[int]:
+    """The numbers of the joint, of the leg's joints, or of all."""
+    joints = [i for i, x in enumerate(robot.joints) if part in (x, x.split("_")[0], "all")]
+    if not joints:
+        has = f"it has {', '.join(robot.joints)}"
+        raise ValueError(f"the {robot.name} has no joint or leg {part!r}; {has}")
+    return joints
 
 
 def faulty_model(fault: str, robot: Robot, healthy: mujoco.MjModel) -> mujoco.MjModel:
     """A copy of the healthy model with the fault in it. ValueError if that cannot be."""
     model = copy.copy(healthy)
     try:
-        for kind, part, size in harms_of(fault):
+        for kind, part, size, *_ in harms_of(fault):
             if kind == "tow":
                 forward = {leg: mount[0] for leg, mount in zip(robot.legs, robot.mounts)}
                 length = TETHER + forward[part] - min(forward.values())
                 model.tendon_range[model.tendon(f"{part}_tether").id, 1] = length
             elif kind == "skate":
                 model.joint(f"{part}_wheel").frictionloss[0] = 0.0
+            elif kind == "payload":
+                model.body(part).mass[0] += size
+            elif kind in ("blow", "imu", "odometry"):
+                model.body(part)  # is there; the model stays as it is (`FaultWriter`)
             else:
-                joints = [x for x in robot.joints if part in (x, x.split("_")[0])]  # the leg's
-                if not joints:
-                    has = f"it has {', '.join(robot.joints)}"
-                    raise ValueError(f"the {robot.name} has no joint or leg {part!r}; {has}")
-                for joint in joints:
-                    _harm_joint(model, joint, kind, size)
+                for joint in joints_of(robot, part):
+                    _harm_joint(model, robot.joints[joint], kind, size)
     except KeyError:
         raise ValueError(f"no {part}, box or wheel for {fault}: make the env with this") from None
     mujoco.mj_setConst(model, mujoco.MjData(model))  # what follows from masses and the like
@@ -98,18 +166,73 @@ def _harm_joint(model: mujoco.MjModel, joint: str, kind: str, size: float) -> No
         raise ValueError(f"{joint} turns from {low:g} to {high:g} rad: no stop at {size:g}")
     elif kind == "half-lock":
         model.joint(joint).range[1] = size
+    elif kind == "late":
+        model.actuator_delay[motor] = size
+
+
+def other_harms(faults: list[str]) -> list[tuple[str, str]]:
+    """The M (kind, part) of all that is harmed but for locks and motors."""
+    harms = {harm[:2] for fault in faults for harm in harms_of(fault) if harm.kind not in MOTORS}
+    return sorted(harms)
+
+
+class Senses:
+    """What the sensors of N robots of K joints say instead of what is so."""
+
+    def __init__(self, N: int, K: int):
+        self.gain, self.bias = np.ones((N, 1, K)), np.zeros((N, 2, K))  # of angle and velocity
+        self.frozen, self.held = np.zeros((N, 1, K), dtype=bool), np.zeros((N, 2, K))
+        self.pitch, self.speed = np.zeros(N), np.ones((N, 1))  # rad, share
+
+    def write(self, fault: str, i: int, robot: Robot) -> None:
+        """Robot i's fail so, and else not. What freezes is held from the next `read` on."""
+        was, self.frozen[i] = self.frozen[i].copy(), False
+        self.gain[i] = self.speed[i] = 1
+        self.bias[i] = self.pitch[i] = 0
+        for kind, part, size, *_ in harms_of(fault):
+            if kind in ("freeze", "bias", "mute"):
+                joints = joints_of(robot, part)
+                self.frozen[i, 0, joints] |= kind == "freeze"
+                self.gain[i, 0, joints] *= kind != "mute"
+                self.bias[i, 0, joints] += size
+            self.pitch[i] += size * (kind == "imu")
+            self.speed[i] *= size if kind == "odometry" else 1
+        self.held[i, :, (self.frozen[i] & ~was)[0]] = np.nan
+
+    def read(self, angle, velocity, linear, angular, gravity) -> list[np.ndarray]:
+        """What is so -> what is sensed: (N, L, J) twice, (N, 3) three times, as in env.py."""
+        joints = np.stack([angle, velocity], axis=1)  # (N, 2, L, J)
+        flat = joints.reshape(self.held.shape)
+        self.held = np.where(np.isnan(self.held), flat, self.held)
+        told = self.gain * np.where(self.frozen, self.held, flat) + self.bias
+        cos, sin = np.cos(self.pitch), np.sin(self.pitch)
+        turned = []
+        for x, y, z in (angular.T, gravity.T):
+            turned.append(np.stack([cos * x - sin * z, y, sin * x + cos * z], axis=1))
+        return [*told.reshape(joints.shape).swapaxes(0, 1), self.speed * linear, *turned]
 
 
 class FaultWriter:
     """Puts faults onto robots of a batch, always from the healthy model: each undoes the last."""
 
-    def __init__(self, robot: Robot, world: Batch):
+    def __init__(self, robot: Robot, world: Batch, faults: list[str]):
         self.robot, self.world = robot, world
-        self.models: dict[str, mujoco.MjModel] = {}  # of each fault that was written
+        self.models: dict[str, mujoco.MjModel] = {}  # of each fault that was met
         self.values: dict[str, np.ndarray] = {}  # {field: (N, ...)}, of all that some fault changes
+        self.senses, self.pushes = None, None  # until some fault needs them
+        self.expect(faults)
 
-    def write(self, fault: str, ids: np.ndarray | int) -> None:
-        """Makes the robots `ids` healthy but for `fault`, or raises ValueError, writing nothing."""
+    def expect(self, faults: list[str]) -> None:
+        """Which may come: whose time comes later is checked now (ValueError), and what critics are
+        told is of these: `told` (N, M), the sizes of `other_harms`."""
+        self.timed = np.array(["@" in fault for fault in faults])
+        for fault in np.array(faults)[self.timed]:
+            self.model("+".join(harm.word for harm in harms_of(str(fault))))
+        self.columns = other_harms(faults)
+        self.told = np.zeros((self.world.nsim, len(self.columns)))
+
+    def model(self, fault: str) -> mujoco.MjModel:
+        """With this fault; every field that it changes is one of `values` from now on."""
         world, healthy = self.world, self.world.model
         if fault not in self.models:
             self.models[fault] = model = faulty_model(fault, self.robot, healthy)
@@ -118,15 +241,45 @@ class FaultWriter:
                     continue  # an option of the simulator, or no change
                 lock = name == "eq_active0"  # acts at MuJoCo's resets only: write the state instead
                 self.values[name] = world.bind("eq_active") if lock else world.expand(name)
+        return self.models[fault]
+
+    def write(self, fault: str, i: int, angles: np.ndarray | None = None) -> None:
+        """Makes robot i healthy but for `fault`, or raises ValueError, writing nothing. angles:
+        (L*J,) rad, at which a lock holds (default: the default pose's)."""
+        world, model, harms = self.world, self.model(fault), harms_of(fault)
+        locked = model.eq_active0.astype(bool) & (angles is not None)
+        if locked.any():
+            self.values["eq_data"] = world.expand("eq_data")
         for name, values in self.values.items():
-            values[ids] = getattr(self.models[fault], name)
+            values[i] = getattr(model, name)
+        if locked.any():
+            self.values["eq_data"][i, locked, 0] = angles[locked]
 
+        blows = [harm for harm in harms if harm.kind == "blow"]
+        if blows or self.pushes is not None:
+            self.pushes = world.bind("xfrc_applied")  # (N, bodies, 6) N, N m
+            self.pushes[i] = 0
+            for _, part, size, *_ in blows:
+                self.pushes[i, model.body(part).id, 1] += size / CONTROL_DT
+        if self.senses is None and any(harm.kind in SENSES for harm in harms):
+            self.senses = Senses(world.nsim, len(self.robot.joints))
+        if self.senses is not None:
+            self.senses.write(fault, i, self.robot)
+        sizes = {harm[:2]: harm.size or 1.0 for harm in harms}
+        self.told[i] = [sizes.get(column, 0.0) for column in self.columns]
 
-def other_harms(faults: list[str]) -> np.ndarray:
-    """(faults, M) for critics: the sizes of all that is harmed but for locks and motors."""
-    harms = [{h[:2]: h.size or 1.0 for h in harms_of(f) if h.kind not in MOTORS} for f in faults]
-    columns = sorted(set().union(*harms))
-    return np.array([[sizes.get(column, 0.0) for column in columns] for sizes in harms])
+    def state_dict(self) -> dict[str, np.ndarray]:
+        """What `write` would not find again: where what has struck is held."""
+        state = {"held": self.senses.held} if self.senses else {}
+        return state | {"eq_data": self.values["eq_data"]} if "eq_data" in self.values else state
+
+    def load_state_dict(self, state: dict) -> None:
+        """The inverse, after all faults have been written."""
+        if "eq_data" in state:
+            self.values["eq_data"] = self.world.expand("eq_data")
+            self.values["eq_data"][:] = state["eq_data"]
+        if "held" in state:
+            self.senses.held[:] = state["held"]
 
 
 @dataclass(frozen=True)

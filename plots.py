@@ -42,7 +42,7 @@ def learning_curves(methods: dict[str, list], picture: Path, title: str) -> None
     """methods: {name: a (n, len(CURVE)) array a seed}. A line is the mean of the seeds, a band what
     lies between the lowest and the highest."""
     figure, axes = grid_of_axes(1, 3, 4, 3, title)
-    names = "return of an episode", "speed / commanded speed", "share of episodes that end in a fall"
+    names = "return of an episode", "speed / commanded speed", "share of falls"
     for axis, name in zip(axes[0], names):
         axis.set(title=name, xlabel="env steps [million]")
         axis.grid(alpha=0.3)
@@ -80,6 +80,21 @@ def chart(panels: dict[str, dict], cases: list[str], picture: Path, title: str, 
         axis.grid(axis="y", alpha=0.3)
     handles = axes[0, 0].get_legend_handles_labels()
     figure.legend(*handles, loc="outside lower center", ncols=min(6, len(methods)))
+    figure.savefig(picture)
+
+
+def heat_maps(maps: dict[str, tuple], rows, columns, picture: Path, title: str) -> None:
+    """A panel a method: {name: (shares, falls)}, each (rows, columns); falls are written in."""
+    figure, axes = grid_of_axes(1, len(maps), 2.2, 0.8 + 0.22 * len(rows), title)
+    for axis, (name, (shares, falls)) in zip(axes[0], maps.items()):
+        image = axis.imshow(shares, cmap="viridis", vmin=0, vmax=1, aspect="auto")
+        axis.set_title(name)
+        axis.set_xticks(range(len(columns)), columns, rotation=60, ha="right")
+        axis.set_yticks(range(len(rows)), rows)
+        for (y, x), fell in np.ndenumerate(falls):
+            if fell > 0:
+                axis.text(x, y, f"{fell:.0%}", ha="center", va="center", size=6, color="w")
+    figure.colorbar(image, ax=axes, shrink=0.7)
     figure.savefig(picture)
 
 

@@ -12,6 +12,7 @@ What a fault (faults.py) changes on one robot is prepared here:
     half-lock       a joint's stops                          jnt_range
     box to tow      a box on a tether, slack without end     tendon_range      only if asked for
     skate           a foot that is a wheel, its brake on     dof_frictionloss  only if asked for
+    late motor      a memory of past targets                 actuator_delay    only if asked for
 """
 
 from dataclasses import dataclass, replace
@@ -21,7 +22,10 @@ import numpy as np
 
 from terrain import Terrain
 
-PHYSICS_DT = 0.005  # s, legged_gym: 200 Hz physics, 4 substeps a control step of 50 Hz
+PHYSICS_DT = 0.005  # s, legged_gym: 200 Hz physics
+SUBSTEPS = 4  # legged_gym: 50 Hz control
+CONTROL_DT = SUBSTEPS * PHYSICS_DT  # s
+MAX_DELAY = 0.04  # s, of a motor that answers late, ours
 # implicitfast takes kd implicitly. Newton needs 2 or 3 iterations; bounded, none stalls others.
 WORLD = f"""
 <mujoco>
@@ -109,14 +113,16 @@ class Robot:
 
 
 def build_model(
-    robot: Robot, terrain: Terrain | None = None, towing: Names = (), skating: Names = ()
-) -> mujoco.MjModel:
+    robot: Robot, terrain: Terrain | None = None,
+    towing: Names = (), skating: Names = (), late: bool = False,
+) -> mujoco.MjModel:  # fmt: skip
     """Keyframe 0 is the default pose; bodies and actuators are in the order of `robot.joints`. The
     sensors `contact_<geom>` count contacts, which are with the ground alone: the trunk's, then leg
     by leg those of each link with a capsule and of the foot.
 
     towing, skating: legs whose foot gets a tether to one box, or becomes a wheel; slack or braked
-    until faults.py changes it. Both add bodies and joints: find a robot's own by name.
+    until faults.py changes it. Both add bodies and joints: find a robot's own by name. late: motors
+    remember their targets, so that they can be late.
     """
     if unknown := {*towing, *skating} - set(robot.legs):
         raise ValueError(f"no leg {', '.join(sorted(unknown))}: the {robot.name} has {robot.legs}")
@@ -156,6 +162,7 @@ def build_model(
             motor = spec.add_actuator(name=name, target=name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
             motor.set_to_position(kp=robot.stiffness, kv=robot.damping)
             motor.forcerange = [-link.effort, link.effort]
+            motor.nsample = late * (1 + round(MAX_DELAY / PHYSICS_DT))
             lock = spec.add_equality(name=name, name1=name, type=mujoco.mjtEq.mjEQ_JOINT)
             lock.objtype, lock.active = mujoco.mjtObj.mjOBJ_JOINT, False
             lock.data[0] = angle  # the joint angle that the lock holds

@@ -179,7 +179,7 @@ class ROLT(nn.Module):
         return self.decoder(self.norm(x)).flatten(1)  # (B, L, J) -> (B, L*J)
 
     def attention(self, observation) -> Tensor:
-        """(B, heads, L, T), how the last layer's legs attend to [legs, action, patches], at test."""
+        """(B, heads, L, T), how the last layer's legs attend to legs, action, patches; at test."""
         return self._encode(observation, {})[1]
 
     def tokens(self, observation, masks: Masks) -> Tensor:

@@ -88,10 +88,13 @@ def origin(path: Path, card: dict) -> dict:
     return {"method": card["policy"], "seed": card["seed"], "checkpoint": str(path)}
 
 
-def walk_cases(args, policies, cases: dict[str, str], speed: float, **sim) -> list[dict]:
+def walk_cases(
+    args, policies, cases: dict[str, str], speed: float, measure=lambda walk, i: {}, **sim
+) -> list[dict]:
     """Every policy on every case, `args.episodes` robots each: rows of the CSV file. Distance is as
     walked; `share` is of the commanded distance, at most 1 (to run ahead is no success). `leg_duty`
-    is of the harmed leg, the least used if several, in the healthy case (1 without one)."""
+    is of the harmed leg, the least used if several, in the healthy case (1 without one). measure:
+    what else is wanted of robot i."""
     labels = [(case, episode) for case in cases for episode in range(args.episodes)]
     faults = [cases[case] for case, _ in labels]
     how, rows = (speed, args.seconds, args.seed, args.threads), []
@@ -108,7 +111,7 @@ def walk_cases(args, policies, cases: dict[str, str], speed: float, **sim) -> li
                 "share": f"{share:.4f}", "fall_time_s": f"{walk.fall_time[i]:.4f}",
                 "leg_duty": f"{min(used, default=1.0):.2f}",
                 "episode_return": f"{walk.returns[i]:.4f}",
-            })  # fmt: skip
+            } | measure(walk, i))  # fmt: skip
         print(f"  {card['policy']}, seed {card['seed']}: done", flush=True)
     return rows
 

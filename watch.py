@@ -25,7 +25,7 @@ from PIL import Image
 
 from checkpoint import load_policy
 from env import CONTROL_DT, LocomotionEnv
-from faults import REAL_WORLD, TASKS, first_task, harms_of, props
+from faults import REAL_WORLD, TASKS, faulty_model, first_task, harms_of, props
 from ppo import to_tensors
 from robots import ROBOTS
 from terrain import Terrain
@@ -104,9 +104,11 @@ class Show:
         """Without a reset, unless a box or wheels come or go. ValueError: there is no such part."""
         if props([fault]) != props([self.fault]):
             return self.start(fault, self.noise)
-        self.env.fault_writer.write(fault, np.array([0]))
+        faulty_model(fault, self.env.robot, self.env.model)  # is it one?
         self.env.pin_faults([fault])  # at the next resets, too
-        self.fault, self.model = fault, painted(self.env, fault)
+        self.env.age[:] = self.env.first_age[:] = 0  # its times count from now on
+        self.env._strike([0])
+        self.fault, self.model = fault, painted(self.env, self.env.fault_now[0])
 
     def hear(self, word: str) -> None:
         """A word of those in HELP. What it cannot read changes nothing, and `said` tells why."""

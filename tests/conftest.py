@@ -18,7 +18,7 @@ from faults import TASKS
 from robots import ROBOTS
 
 CARD = {"robot": "a1", "task": "stiffness", "policy": "rolt", "scan": False}
-CARD |= {"seed": 0, "steps": 0, "stages": {}, "init": None, "curve": torch.zeros(2, 5)}
+CARD |= {"seed": 0, "steps": 0, "stages": {}, "init": None, "curve": torch.ones(2, 5)}
 
 
 def save_policy(path, weights=None, **card):

@@ -1,4 +1,4 @@
-"""What several seeds say together, and a verdict on each claim of the paper.
+"""From rows to tables and charts: what several seeds say together, and a verdict on each claim.
 
     python evaluate.py claims    # from the CSV files that the tests have left in --out
 
@@ -15,6 +15,9 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+
+import plots
+from walk import write_csv
 
 DRAWS = 2000
 SEEDS = 3  # ours: fewer give no verdict
@@ -106,6 +109,38 @@ def compare(rows: list[dict], groups: dict[str, list[str]], best: str = "rolt") 
                 continue
             p = permutation_p(ours.mean(axis=1), theirs.mean(axis=1))
             print(line, f"| {probability_better(ours, theirs):.0%} | {p:.3f} |")
+
+
+def report(args, rows: list[dict], columns: dict[str, str], title: str, seen=(), x="") -> None:
+    """Writes EXPERIMENT.csv and .png, prints a table of each of the columns {column: what}: mean
+    over seeds of the mean over episodes (95 % interval). seen: cases that were trained on, where
+    who does not walk is not trained; x: see `chart`."""
+    for row in rows:
+        row["seen"] = int(row["case"] in seen)
+    path = args.out / args.experiment
+    write_csv(path.with_suffix(".csv"), rows)
+    methods, cases = ([*dict.fromkeys(row[key] for row in rows)] for key in ("method", "case"))
+    unused = {(row["method"], row["case"]) for row in rows if float(row.get("leg_duty", 1)) < USED}
+    heads = {m: m if trained(rows, m) else f"{m}, not trained" for m in methods}
+    labels = [f"{case} (seen)" if case in seen and not x else case for case in cases]
+    panels = {}
+    for column, what in columns.items():
+        print(f"\n{title}: {what}\n")
+        print("|", *(f"| {head}" for head in heads.values()), "|")
+        print("|---" * (len(methods) + 1) + "|")
+        panels[what] = {head: [] for head in heads.values()}
+        for case, label in zip(cases, labels):
+            line = f"| {label} |"
+            for method, head in heads.items():
+                seeds = by_seed(rows, column, method=method, case=case)
+                mean, low, high = mean_and_interval(seeds) if seeds else (np.nan,) * 3
+                panels[what][head].append((mean, low, high, [x.mean() for x in seeds]))
+                line += f" {mean:.2f}" + f" ({low:.2f} to {high:.2f})" * (low < high)
+                line += " * |" if (method, case) in unused else " |"
+            print(line)
+    if unused:
+        print("\n* the leg is hardly used when healthy by one of the seeds or more: no test")
+    plots.chart(panels, labels, path.with_suffix(".png"), title, x)
 
 
 class Claim(NamedTuple):

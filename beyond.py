@@ -1,0 +1,129 @@
+"""What the paper does not ask: how a policy grew, and what else it survives. Run by evaluate.py.
+
+    python evaluate.py sudden             # a fault that strikes in mid-stride, and goes
+    python evaluate.py matrix [--pairs]   # every joint, five ways
+    python evaluate.py senses             # sensors that fail, motors that are late
+    python evaluate.py growth --checkpoints runs/*/policy-*M.pt
+    python evaluate.py curves             # learning curves
+
+All on flat ground, told to walk at 0.75 m/s. Policies were trained on none of it, but for the
+faults of their task.
+"""
+
+from itertools import combinations
+
+import numpy as np
+
+import plots
+from env import CONTROL_DT
+from faults import HEALTHY, TASKS
+from report import by_seed, mean_and_interval, report, scores
+from robots import ROBOTS
+from walk import Walk, walk_cases, write_csv
+
+SPEED = 0.75  # m/s, the paper's
+STRIKE, END = 5.0, 12.0  # s
+BACK = 0.8  # of the speed before
+HARMS = {"lock": "lock:{}", "disable": "disable:{}"}
+HARMS |= {f"weaken to {x}": f"weaken:{{}}:{x}" for x in (0.75, 0.5, 0.25)}
+KEY = ("checkpoint", "case", "episode")  # of a row
+# What is late or sensed wrongly, five severities each. The last two: of how many quarters of legs.
+SEVERITIES = {
+    "late": (0, 0.01, 0.02, 0.03, 0.04),  # s, all motors
+    "bias": (0, 0.05, 0.1, 0.2, 0.4),  # rad, all angles
+    "imu": (0, 0.05, 0.1, 0.2, 0.4),  # rad
+    "odometry": (1, 0.75, 0.5, 0.25, 0),  # share of the velocity that is sensed
+    "freeze": (0, 1, 2, 3, 4), "mute": (0, 1, 2, 3, 4),
+}  # fmt: skip
+
+
+def curves(args, policies) -> None:
+    """How each method learned, in training: mean over the seeds, and their range."""
+    methods = {}
+    for _, card in policies.values():
+        if len(card["curve"]):
+            methods.setdefault(card["policy"], []).append(card["curve"].numpy())
+    plots.learning_curves(methods, args.out / "curves.png", f"{args.robot}, {args.task}")
+
+
+def growth(args, policies) -> None:
+    """Success on what was never seen, against the steps of training."""
+    rows = walk_cases(args, policies, {fault: fault for fault in TASKS[args.task].unseen}, SPEED)
+    steps = {str(path): card["steps"] for path, (_, card) in policies.items()}
+    for row in rows:
+        row |= {"fault": row["case"], "method": row["method"].split()[0]}
+        row["case"] = f"{steps[row['checkpoint']] / 1e6:.1f}"
+    rows.sort(key=lambda row: float(row["case"]))
+    columns = {"success": "success on unseen faults", "share": "share of the distance"}
+    report(args, rows, columns, f"Growth: {args.robot}", x="env steps [million]")
+
+
+def sudden(args, policies) -> None:
+    """A healthy walk; at 5 s an unseen fault strikes, at 12 s it has gone. How long until the robot
+    goes at 80 % of its former speed again (mean over a second; 8 s: not within the test)?"""
+    args.seconds = 20.0
+    faults = TASKS[args.task].unseen
+    cases = {HEALTHY: HEALTHY} | {fault: f"{fault}@{STRIKE:g}:{END:g}" for fault in faults}
+    rows = walk_cases(args, policies, cases, SPEED, recovery)
+    columns = {"fell": "share of falls", "during": "speed while it lasts / before"}
+    columns |= {"recovery_s": "time to recover [s]", "distance_m": "distance walked [m]"}
+    report(args, rows, columns, f"Sudden faults, {STRIKE:g} to {END:g} s: {args.robot}")
+
+
+def recovery(walk: Walk, i: int) -> dict[str, str]:
+    """Of robot i; who falls does not recover."""
+    x, second = walk.poses[: walk.steps[i] + 1, i, 0], round(1 / CONTROL_DT)
+    strike, end = round(STRIKE / CONTROL_DT), round(END / CONTROL_DT)
+    numbers = {"during": 0.0, "recovery_s": (len(walk.poses) - end) * CONTROL_DT}
+    if walk.steps[i] >= end:
+        before = (x[strike] - x[second]) / (strike - second)  # m a step
+        numbers["during"] = (x[end] - x[strike]) / (end - strike) / before
+        speed = (x[end:] - x[end - second : -second]) / second  # the mean of the second before
+        if not walk.fell[i] and (back := np.flatnonzero(speed >= BACK * before)).size:
+            numbers["recovery_s"] = back[0] * CONTROL_DT
+    return {name: f"{number:.3f}" for name, number in numbers.items()}
+
+
+def matrix(args, policies) -> None:
+    """Every joint locked, dead or weak, one at a time (--pairs: two legs at a time, their calves
+    locked or dead, or all weak). Survived: no fall, at least half of the commanded distance."""
+    robot = ROBOTS[args.robot]
+    parts = [(joint,) for joint in robot.joints]
+    if args.pairs:
+        parts = list(combinations(robot.legs, 2))
+    last = robot.joints[-1].split("_")[1]
+    cases = {}
+    for names in parts:
+        for harm, word in HARMS.items():
+            whole = [f"{x}_{last}" if args.pairs and ":{}:" not in word else x for x in names]
+            cases[f"{'+'.join(names)}, {harm}"] = "+".join(word.format(name) for name in whole)
+    rows = walk_cases(args, policies, cases, SPEED)
+    name = "matrix-pairs" if args.pairs else "matrix"
+    write_csv(args.out / f"{name}.csv", rows)
+    maps = {}
+    print("\n| method | share of the map that is survived |\n|---|---|")
+    for method in dict.fromkeys(row["method"] for row in rows):
+        mean, low, high = mean_and_interval(by_seed(rows, "success", method=method))
+        print(f"| {method} | {mean:.2f} ({low:.2f} to {high:.2f}) |")
+        both = (scores(rows, method, [*cases], column).mean(axis=0) for column in ("share", "fell"))
+        maps[f"{method}: {mean:.0%} survived"] = [x.reshape(len(parts), -1) for x in both]
+    labels = ["+".join(names) for names in parts], [*HARMS]
+    title = f"Share of the distance, and falls: {robot.name}"
+    plots.heat_maps(maps, *labels, args.out / f"{name}.png", title)
+
+
+def senses(args, policies) -> None:
+    """Success against how badly a sense fails (SEVERITIES, from none to most)."""
+    legs, rows = ROBOTS[args.robot].legs, {}
+    for kind, sizes in SEVERITIES.items():
+        part = "trunk" if kind in ("imu", "odometry") else "all"
+        words = [f"{kind}:{part}:{size}" for size in sizes]
+        if kind in ("freeze", "mute"):
+            broken = [legs[: n * len(legs) // 4] for n in sizes]
+            words = ["+".join(f"{kind}:{leg}" for leg in some) or HEALTHY for some in broken]
+        for row in walk_cases(args, policies, {str(i): x for i, x in enumerate(words)}, SPEED):
+            key = tuple(row[name] for name in KEY)
+            first = {name: row[name] for name in ("method", "seed", *KEY)}
+            rows.setdefault(key, first)[kind] = row["success"]
+    columns = {kind: f"success: {kind}, {sizes}" for kind, sizes in SEVERITIES.items()}
+    report(args, [*rows.values()], columns, f"Senses: {args.robot}", x="severity")
