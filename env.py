@@ -76,8 +76,8 @@ class EnvConfig:
     start_speed: float = 0.5  # m/s and rad/s, the trunk's velocities within +-, legged_gym
     push_seconds: float = 15.0  # legged_gym: then the trunk's velocity is redrawn
     push_speed: float = 1.0  # m/s, x and y within +-, legged_gym; 0 = no pushes
-    start_rows: int = 3  # of the terrain, on which robots begin, ours (legged_gym: 6 of 10)
-    climb: bool = True  # from row to row by the curriculum; False = always start on the first rows
+    start_rows: int = 1  # of the terrain, on which robots begin, ours (NOTES 17; legged_gym: 6)
+    climb: bool = True  # from row to row by the curriculum; False = always start on the first
 
 
 class LocomotionEnv:
