@@ -207,7 +207,8 @@ class LocomotionEnv:
         info["episode_returns"] = self.episode_return[ended]
         info["episode_lengths"] = (self.age - self.first_age)[ended]
         if len(ended):
-            self._climb(ended[~diverged[ended]])  # a diverged one is nowhere
+            known = ended[~diverged[ended]]  # a diverged one is nowhere
+            self._climb(known, fallen[known])
             self._reset(ended)
         return self.observe(), reward.astype(np.float32), terminated, truncated, info
 
@@ -292,12 +293,13 @@ class LocomotionEnv:
                 self.fault_writer.write(now, i, None if anew else self._qpos[i, self._angle_at])
                 self.fault_now[i] = now
 
-    def _climb(self, ids: np.ndarray) -> None:
+    def _climb(self, ids: np.ndarray, fallen: np.ndarray) -> None:
         """The terrain's curriculum, at the end of an episode."""
         if self.terrain and self.config.climb:
             distance = np.linalg.norm(self.position[ids, :2] - self.start[ids], axis=1)
             commanded = np.linalg.norm(self.command[ids, :2], axis=1) * self.config.episode_seconds
-            self.row[ids] = self.terrain.next_row(self.row[ids], distance, commanded, self.rng)
+            reached = self.row[ids], distance, commanded, fallen
+            self.row[ids] = self.terrain.next_row(*reached, self.rng)
 
     def _resample_commands(self, ids: np.ndarray) -> None:
         """A forward and a lateral speed, and a heading, for each of the robots `ids`."""

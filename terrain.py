@@ -89,10 +89,11 @@ class Terrain:
                         if top > 0:
                             _add_box(spec, x + centres[i], y + centres[j], BLOCK / 2, top)
 
-    def next_row(self, row: np.ndarray, distance: np.ndarray, commanded: np.ndarray, rng):
+    def next_row(self, row, distance, commanded, fallen, rng) -> np.ndarray:
         """legged_gym's curriculum, at the end of an episode: up a level after half a tile, down
-        after less than half of the commanded distance; after the last level, any. All (n,), m."""
-        up = distance > TILE / 2
+        after less than half of the commanded distance; after the last level, any. Not up for who
+        has fallen, ours (NOTES 17). All (n,), m."""
+        up = (distance > TILE / 2) & ~fallen
         down = ~up & (distance < 0.5 * commanded)
         row = np.maximum(row + up.astype(int) - down, 0)
         return np.where(row < len(self.levels), row, rng.integers(len(self.levels), size=len(row)))
