@@ -1,8 +1,8 @@
 """Policies and runs as files: saved whole or not at all, and read without running what is inside.
 
 Two kinds, both of torch.save, both dictionaries of plain values and tensors:
-    policy.pt      `CARD`, the weights, matrices in half precision, and the learning curve (n,
-                   len(CURVE)): 1 MB, to show and give away
+    policy.pt      `CARD`, policy and critic, matrices in half precision, and the learning curve (n,
+                   len(CURVE)): 2 MB, to show, to give away, and to start from (`--init`)
     checkpoint.pt  the same in full, and all else that `train.py --resume` needs to go on
 """
 
@@ -41,8 +41,11 @@ def save(content: dict, path: Path) -> None:
 
 def save_policy(content: dict, path: Path) -> None:
     """The part of a checkpoint.pt that a policy.pt is."""
-    halves = {name: x.half() if x.dim() > 1 else x for name, x in content["weights"].items()}
-    save({key: content[key] for key in (*CARD, "curve")} | {"weights": halves}, path)
+    part = {key: content[key] for key in (*CARD, "curve")}
+    for module in ("weights", "critic"):
+        x = content[module]
+        part[module] = {name: w.half() if w.dim() > 1 else w for name, w in x.items()}
+    save(part, path)
 
 
 def load(path: str | Path) -> dict:
@@ -82,10 +85,10 @@ def load_policy(path: str | Path, robot: str | None = None) -> tuple[torch.nn.Mo
 
 
 def start_from(path: str | Path, policy: torch.nn.Module, critic: torch.nn.Module) -> None:
-    """Puts the file's weights into a fresh policy and, of a checkpoint.pt, into a fresh critic. New
-    inputs (the scan) come last, and their weights start at 0: nothing changes at first."""
+    """Puts the file's policy and critic into fresh ones. New inputs (the scan) come last, and their
+    weights start at 0: nothing changes at first (a ROLT's new patch tokens do draw attention)."""
     with loaded(path) as content:
-        for module, saved in ((policy, content["weights"]), (critic, content.get("critic", {}))):
+        for module, saved in ((policy, content["weights"]), (critic, content["critic"])):
             own = module.state_dict()
             for name, x in saved.items():
                 if x.shape != own[name].shape:  # (outputs, inputs)

@@ -76,8 +76,8 @@ class EnvConfig:
     start_speed: float = 0.5  # m/s and rad/s, the trunk's velocities within +-, legged_gym
     push_seconds: float = 15.0  # legged_gym: then the trunk's velocity is redrawn
     push_speed: float = 1.0  # m/s, x and y within +-, legged_gym; 0 = no pushes
-    start_rows: int = 1  # of the terrain, on which robots begin, ours (NOTES 17; legged_gym: 6)
-    climb: bool = True  # from row to row by the curriculum; False = always start on the first
+    start_rows: int = 3  # of the terrain, on which robots begin, ours (legged_gym: 6 of 10)
+    climb: bool = True  # from row to row by the curriculum; False = always start on the first rows
 
 
 class LocomotionEnv:
@@ -207,8 +207,7 @@ class LocomotionEnv:
         info["episode_returns"] = self.episode_return[ended]
         info["episode_lengths"] = (self.age - self.first_age)[ended]
         if len(ended):
-            known = ended[~diverged[ended]]  # a diverged one is nowhere
-            self._climb(known, fallen[known])
+            self._climb(ended[~diverged[ended]])  # a diverged one is nowhere
             self._reset(ended)
         return self.observe(), reward.astype(np.float32), terminated, truncated, info
 
@@ -293,13 +292,12 @@ class LocomotionEnv:
                 self.fault_writer.write(now, i, None if anew else self._qpos[i, self._angle_at])
                 self.fault_now[i] = now
 
-    def _climb(self, ids: np.ndarray, fallen: np.ndarray) -> None:
+    def _climb(self, ids: np.ndarray) -> None:
         """The terrain's curriculum, at the end of an episode."""
         if self.terrain and self.config.climb:
             distance = np.linalg.norm(self.position[ids, :2] - self.start[ids], axis=1)
             commanded = np.linalg.norm(self.command[ids, :2], axis=1) * self.config.episode_seconds
-            reached = self.row[ids], distance, commanded, fallen
-            self.row[ids] = self.terrain.next_row(*reached, self.rng)
+            self.row[ids] = self.terrain.next_row(self.row[ids], distance, commanded, self.rng)
 
     def _resample_commands(self, ids: np.ndarray) -> None:
         """A forward and a lateral speed, and a heading, for each of the robots `ids`."""

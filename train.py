@@ -32,7 +32,7 @@ from baselines import METHODS, Stage, make_policy, training_stages
 from env import CONTROL_DT, EnvConfig, LocomotionEnv
 from faults import TASKS, first_task
 from plots import learning_curve
-from ppo import Critic, PPOConfig, RolloutBuffer, average, collect
+from ppo import Critic, Learner, PPOConfig, RolloutBuffer, average, collect
 from robots import ROBOTS
 from walk import write_csv
 
@@ -106,7 +106,8 @@ def parse_arguments(argv: list[str] | None = None):
 class StageRun:
     """A stage under way (most methods have one): its robots, buffer, critic and learner."""
 
-    def __init__(self, number: int, stage: Stage, args, rank: int, policy, device):
+    def __init__(self, number: int, stage: Stage, args, rank: int, policy, device, critic=None):
+        """critic: the last stage's, kept by one that trains none, for who starts from this run."""
         n, local = args.envs // args.processes, os.environ.get("LOCAL_WORLD_SIZE", args.processes)
         self.number, self.actor = number, stage.actor
         self.env = LocomotionEnv(
@@ -117,7 +118,8 @@ class StageRun:
         )  # fmt: skip
         self.observation = self.env.reset(random_ages=True)
 
-        self.critic = (stage.critic or Critic(self.observation)).to(device)
+        kept = critic if stage.learner is not Learner else None
+        self.critic = (stage.critic or kept or Critic(self.observation)).to(device)
         policy.requires_grad_(False)
         for trained in stage.trained:
             trained.requires_grad_(True)
@@ -196,7 +198,8 @@ def train(rank: int, args, sync: str) -> None:
     saved_at, stop = time.monotonic(), False
     while steps < ends[-1] and not stop:
         if steps >= ends[run.number + 1]:
-            run = StageRun(run.number + 1, stages[run.number + 1], args, rank, policy, device)
+            i = run.number + 1
+            run = StageRun(i, stages[i], args, rank, policy, device, run.critic)
         begin, end = ends[run.number : run.number + 2]
         started = time.perf_counter()
         run.observation, infos = collect(

@@ -27,7 +27,7 @@ def save_policy(path, weights=None, **card):
     if weights is None:
         robot, task = ROBOTS[card["robot"]], TASKS[card["task"]]
         weights = make_policy(card["policy"], robot, task, card["scan"]).state_dict()
-    checkpoint.save(card | {"weights": weights}, Path(path))
+    checkpoint.save(card | {"weights": weights, "critic": {}}, Path(path))
     return str(path)
 
 

@@ -17,7 +17,9 @@ import train
 import watch
 from baselines import make_policy
 from conftest import save_policy
+from env import LocomotionEnv
 from faults import TASKS
+from ppo import Critic
 from robots import A1
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -95,7 +97,9 @@ def test_a_resumed_run_may_not_change(tmp_path, capsys):
 def test_stairs_begin_with_the_flat_policy(tmp_path):
     """What reads the heights is new: its weights begin at 0, so that an MLP's answers are kept."""
     words, task = ["--threads", "1", *SMALL, "--steps", "192"], TASKS["terrain"]
-    flat, stairs, critic = tmp_path / "flat", tmp_path / "stairs", torch.nn.Linear(1, 1)
+    flat, stairs = tmp_path / "flat", tmp_path / "stairs"
+    env = LocomotionEnv("a1", 1, num_threads=1, extras=("privileged", "heights"))
+    critic = Critic(env.reset())
     train.main([*words, "--policy", "mlp", "--out", str(flat)])
     first = str(flat / "checkpoint.pt")
     more = ["--policy", "mlp", "--task", "terrain", "--out", str(stairs), "--init", first]
@@ -106,6 +110,8 @@ def test_stairs_begin_with_the_flat_policy(tmp_path):
     checkpoint.start_from(flat / "policy.pt", after, critic)
     assert torch.equal(after.hidden[0].weight[:, :480], before.hidden[0].weight)
     assert not after.hidden[0].weight[:, 480:].any()
+    told, heights = critic.network[0].weight.split([480 + 25, 192], dim=1)
+    assert told.half().float().equal(told) and told.any() and not heights.any()  # critics, too
     for policy in ("rma", "rolt"):
         path = save_policy(tmp_path / f"{policy}.pt", policy=policy)
         checkpoint.start_from(path, make_policy(policy, A1, task, True), critic)
