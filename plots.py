@@ -18,16 +18,16 @@ def grid_of_axes(rows: int, columns: int, width: float, height: float, title: st
     return figure, figure.subplots(rows, columns, squeeze=False)
 
 
-def learning_curve(progress: Path, picture: Path) -> None:
-    """Draws a run's progress.csv over steps."""
-    column = np.atleast_1d(np.genfromtxt(progress, delimiter=",", names=True))
+def learning_curve(rows: list[dict], picture: Path) -> None:
+    """Draws the rows of a run's progress.csv over steps."""
+    column = {name: np.array([float(row[name]) for row in rows]) for name in rows[0]}
     panels = {
         "return of an episode": ["episode_return"],
         "forward speed [m/s]": ["speed", "commanded_speed"],
         "length of an episode [s]": ["episode_seconds"],
         "std of the actions, KL of an update": ["std", "kl"],
     }
-    figure, axes = grid_of_axes(2, 2, 4.5, 2.75, progress.parent.name)
+    figure, axes = grid_of_axes(2, 2, 4.5, 2.75, picture.parent.name)
     for axis, (title, names) in zip(axes.flat, panels.items()):
         for name in names:
             axis.plot(column["steps"] / 1e6, column[name], lw=1.2, label=name.replace("_", " "))

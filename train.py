@@ -47,6 +47,11 @@ def parse_arguments(argv: list[str] | None = None):
             raise ValueError
         return int(float(text))
 
+    def file(text: str) -> Path:
+        if not text:
+            raise ValueError
+        return Path(text)
+
     devices = ("cpu", "cuda") if torch.cuda.is_available() else ("cpu",)
     style = {"formatter_class": argparse.RawDescriptionHelpFormatter, "usage": argparse.SUPPRESS}
     parser = argparse.ArgumentParser(description=__doc__, **style)
@@ -60,12 +65,12 @@ def parse_arguments(argv: list[str] | None = None):
     add("--minibatches", type=count, default=PPOConfig.minibatches, help="an epoch")
     add("--paper", action="store_true", help="4096 robots, 400M steps, 5 epochs of 4 minibatches")
     add("--scan", action="store_true", help="the height scan on flat ground, too (as in the paper)")
-    add("--init", metavar="FILE", help="a checkpoint.pt to start from: flat, then stairs")
+    add("--init", type=file, help="a policy.pt or checkpoint.pt to start from: flat, then stairs")
     add("--seed", type=int, default=0)
     add("--device", choices=devices, default=devices[-1], help="default: cuda if there is one")
     add("--precision", choices=("auto", "fp32", "bf16"), default="auto", help="auto: bf16 if fast")
     add("--threads", type=count, help="cores to use (default: all, or as many as divide --envs)")
-    add("--out", type=Path, help="folder of the run (default: runs/ROBOT-TASK-POLICY-seedN)")
+    add("--out", type=file, help="folder of the run (default: runs/ROBOT-TASK-POLICY-seedN)")
     add("--resume", action="store_true", help="go on from the checkpoint in that folder")
     add("--save-minutes", type=float, default=3.0, help="time between two checkpoints")
     args = parser.parse_args(argv)
@@ -90,7 +95,9 @@ def parse_arguments(argv: list[str] | None = None):
     if args.threads is None:
         cores = len(os.sched_getaffinity(0)) if sys.platform == "linux" else os.cpu_count()
         args.threads = max(n for n in range(1, cores + 1) if cuda or args.envs % n == 0)
-    args.processes = int(os.environ.get("WORLD_SIZE", 1 if cuda else args.threads))
+    args.init = args.init and str(args.init)
+    torchrun = dist.is_torchelastic_launched()
+    args.processes = int(os.environ["WORLD_SIZE"]) if torchrun else 1 if cuda else args.threads
     if args.envs % args.processes:
         parser.error(f"{args.envs} robots do not divide among {args.processes} processes")
     samples = args.envs // args.processes * PPOConfig.steps
@@ -191,7 +198,7 @@ def train(rank: int, args, sync: str) -> None:
             checkpoint.save_policy(content, args.out / "policy.pt")
             if snapshot:  # to see how a policy grew
                 checkpoint.save_policy(content, args.out / f"policy-{steps / 1e6:.1f}M.pt")
-            learning_curve(args.out / "progress.csv", args.out / "progress.png")
+            learning_curve(progress.rows, args.out / "progress.png")
 
     if rank == 0:
         progress = Progress(args.out / "progress.csv", iteration, steps, ends[-1])
@@ -226,7 +233,9 @@ def train(rank: int, args, sync: str) -> None:
             save(snapshot)
             saved_at = time.monotonic()
 
-    if rank == 0 and steps < ends[-1]:
+    if rank == 0 and saved["steps"] >= ends[-1]:
+        print(f"it was finished already; the policy: {args.out / 'policy.pt'}")
+    elif rank == 0 and steps < ends[-1]:
         print(f"\nstopped at {steps:,} steps and saved; the same command with --resume goes on")
     elif rank == 0:
         print(f"\nthe policy: {args.out / 'policy.pt'}; what to do with it: evaluate.py --help")
@@ -255,11 +264,19 @@ class Progress:
     def __init__(self, path: Path, iteration: int, steps: int, total: int):
         """iteration: from which a run goes on; later rows of an earlier try are dropped."""
         self.path, self.total, self.first, self.start = path, total, steps, time.monotonic()
-        self.rows = []
-        if iteration:
-            with open(path, newline="") as file:
-                self.rows = [x for x in csv.DictReader(file) if int(x["iteration"]) <= iteration]
+        self.rows = self._read(iteration) if iteration else []
+        if self.rows:
             write_csv(path, self.rows)
+
+    def _read(self, iteration: int) -> list[dict]:
+        try:
+            with open(self.path, newline="") as file:
+                rows = [x for x in csv.DictReader(file) if int(x["iteration"]) <= iteration]
+            [float(number) for row in rows for number in row.values()]
+            return rows
+        except (OSError, KeyError, ValueError, TypeError):
+            print(f"warning: {self.path} was damaged and begins anew", file=sys.stderr)
+            return []
 
     def curve(self) -> torch.Tensor:
         """(n, len(CURVE)), every tenth iteration."""
@@ -281,9 +298,10 @@ class Progress:
         line = (
             f"[{'#' * int(20 * steps / total):.<20.20}] {steps / 1e6:.2f}/{total / 1e6:.2f}M"
             f" {rate:,.0f}/s {max(0, total - steps) / rate / 60:.0f} min left"
-            f" | return {returns:.1f} speed {row['speed']:.2f} of {row['commanded_speed']:.2f} m/s"
-            f" episode {row['episode_seconds']:.1f} s falls {falls:.0%} std {row['std']:.2f}"
+            f" | speed {row['speed']:.2f} of {row['commanded_speed']:.2f} m/s std {row['std']:.2f}"
         )
+        if episodes:
+            line += f" return {returns:.1f} episode {row['episode_seconds']:.1f} s falls {falls:.0%}"
         if sys.stdout.isatty():
             print(f"\r{line}\033[K", end="", flush=True)
         elif row["iteration"] % 10 == 1:  # not to fill a log
@@ -305,8 +323,10 @@ def guarded(rank: int, args, sync: str) -> None:
 
 def main(argv: list[str] | None = None) -> None:
     args = parse_arguments(argv)
-    if args.processes == 1 or "RANK" in os.environ:  # torchrun has made the processes
-        return guarded(int(os.environ.get("RANK", 0)), args, "env://")
+    if dist.is_torchelastic_launched():  # torchrun has made the processes
+        return guarded(int(os.environ["RANK"]), args, "env://")
+    if args.processes == 1:
+        return guarded(0, args, "")
     with tempfile.TemporaryDirectory() as folder:
         others = (args, f"file://{folder}/sync")
         context = torch.multiprocessing.spawn(guarded, others, args.processes, join=False)

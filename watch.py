@@ -4,9 +4,9 @@
     python evaluate.py watch --stairs 0 --noise offset:0.2    # steps of 5 cm, scandots that lie
     python evaluate.py watch --fault tow:RR --out tow.gif     # no viewer, a moving picture
 
-Where there is a display, a window opens, with a panel for speed and faults; elsewhere a page for
-the browser does the same, open to all who can reach the port (`ssh -L 8080:localhost:8080`). The
-terminal takes words, too. A robot that falls starts over.
+Where there is a display, a window opens, with a panel for speed and faults. --public makes it a
+page for the browser, which MuJoCo serves to all who can reach the port, with all that the panel
+does. The terminal takes words, too. A robot that falls starts over.
 """
 
 import argparse
@@ -142,7 +142,7 @@ class Show:
         self.data.time += CONTROL_DT
 
 
-def view(show: Show, viewer: str, port: int) -> None:
+def view(show: Show, public: bool, port: int) -> None:
     """MuJoCo's viewer, a window or a web page, with a panel of our own; until it is closed."""
     from mujoco.studio import launch_passive, messages, plugin, viewer_protocol
     from mujoco.studio.dear_imgui import dear_imgui as imgui
@@ -183,7 +183,7 @@ def view(show: Show, viewer: str, port: int) -> None:
                     show.words.put("again")
             imgui.End()
 
-    gfx = "web" if viewer == "browser" else ""
+    gfx = "web" if public else ""
     config = viewer_protocol.ViewerConfig(title=f"ROLT: {show.robot}", gfx=gfx, http_port=port)
     with launch_passive.launch(config, plugins=[Panel()]) as handle:
         while handle.is_running() and not show.over:
@@ -204,13 +204,16 @@ def main(argv: list[str] | None = None) -> None:
     add("--stairs", type=int, choices=levels, metavar="LEVEL", help="-2 to 10 (default: flat)")
     add("--noise", default="clean", help="on the scandots: offset:0.2, sigma:0.1, missing:4")
     add("--seed", type=int, default=0)
-    add("--viewer", choices=("window", "browser"), help="default: a window if there is a display")
-    add("--port", type=int, default=0, help="of the browser viewer (default: the first from 8080)")
+    add("--public", action="store_true", help="a page, for all who can reach this machine's port")
+    add("--port", type=int, default=0, help="of the page (default: the first free from 8080)")
     add("--out", type=Path, metavar="FILE.gif", help="write a film instead")
     add("--seconds", type=float, default=4.0, help="of the film (default 4)")
     args = parser.parse_args(argv)
     if args.out and args.out.suffix != ".gif":
         parser.error(f"--out is a .gif file, not {args.out}")
+    if NO_DISPLAY and not args.out and not args.public:
+        page = "--public a page that all can open who reach this machine"
+        parser.error(f"there is no display: --out walk.gif writes a film, {page}")
     torch.set_num_threads(1)
     try:
         task = first_task(args.robot) if args.stairs is None else "terrain"
@@ -222,7 +225,7 @@ def main(argv: list[str] | None = None) -> None:
         show = Show(policy, args.robot, args.fault, args.speed, args.seed, terrain, args.noise)
         print(HELP)
         threading.Thread(target=lambda: [*map(show.words.put, sys.stdin)], daemon=True).start()
-        view(show, args.viewer or ("browser" if NO_DISPLAY else "window"), args.port)
+        view(show, args.public, args.port)
     except KeyboardInterrupt:
         pass
     except (ValueError, RuntimeError, ImportError, OSError, ArithmeticError) as error:

@@ -256,3 +256,13 @@ def test_a_checkpoint_is_never_executed(tmp_path):
 def test_the_model_needs_torch_alone():
     imports = re.findall(r"^(?:from|import) (\w+)", (ROOT / "rolt.py").read_text(), re.MULTILINE)
     assert set(imports) - sys.stdlib_module_names == {"torch"}
+
+
+def test_a_damaged_table_costs_the_table_alone(tmp_path, capsys):
+    words = ["--threads", "1", *SMALL, "--steps", "384", "--out", str(tmp_path)]
+    train.main(words)
+    (tmp_path / "progress.csv").write_text("iteration,steps\n1,x\n")
+    train.main([*words, "--resume"])
+    told = capsys.readouterr()
+    assert "damaged and begins anew" in told.err and "it was finished already" in told.out
+    assert "nan" not in told.out and "no episode" not in told.out
