@@ -333,6 +333,8 @@ def main(argv: list[str] | None = None) -> None:
         with torch.no_grad():
             function(args, policies)
         print(f"\nwritten: {args.out / args.experiment}.*")
+    except KeyboardInterrupt:
+        sys.exit("\nstopped; nothing was written")
     except (ValueError, OSError, ArithmeticError, MemoryError) as error:
         sys.exit(f"error: {error}")
 

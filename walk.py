@@ -5,6 +5,7 @@ Robots go straight on and unpushed; starts vary as in training. N robots, T step
 
 import csv
 import sys
+import time
 from pathlib import Path
 from typing import NamedTuple
 
@@ -40,11 +41,22 @@ class Walk(NamedTuple):
     fell: np.ndarray  # (N,) bool
 
 
+def show_progress(label: str, done: int, total: int, start: float) -> None:
+    """One line on a terminal, and how long it will take."""
+    if sys.stderr.isatty() and done % 10 == 0:
+        left = (time.monotonic() - start) * (total - done) / done
+        bar = f"\r\033[K{label} [{'#' * (20 * done // total):.<20}] {left:.0f} s left"
+        print(bar if done < total else "\r\033[K", end="", file=sys.stderr, flush=True)
+
+
 @torch.no_grad()
-def take_a_walk(policy, robot, faults, speed, seconds, seed=0, threads=0, seen=None, **sim) -> Walk:
+def take_a_walk(
+    policy, robot, faults, speed, seconds, seed=0, threads=0, seen=None, label="", **sim
+) -> Walk:
     """Robot i with faults[i], at speed m/s. seen: a list to which each step's observation is added.
-    sim: options of LocomotionEnv, as terrain and noise. A fall: the trunk on the ground or tilted
-    by more than 60 degrees, or a simulation that diverges (which is said on stderr)."""
+    label: of the progress that is shown. sim: options of LocomotionEnv, as terrain and noise. A
+    fall: the trunk on the ground or tilted by more than 60 degrees, or a simulation that diverges
+    (which is said on stderr)."""
     N, situations = len(faults), [(1.0, fault) for fault in faults]
     config, extras = straight_ahead(policy, speed, seconds), policy.extras
     env = LocomotionEnv(robot, N, seed, threads, situations, config, extras, **sim)
@@ -53,7 +65,8 @@ def take_a_walk(policy, robot, faults, speed, seconds, seed=0, threads=0, seen=N
     observation, poses, contacts = env.reset(), [], []
     start, distance, returns = env.position[:, 0].copy(), np.zeros(N), np.zeros(N)
     upright, steps, divergences = np.ones(N, dtype=bool), np.zeros(N, dtype=int), 0
-    for _ in range(round(seconds / CONTROL_DT)):
+    began, T = time.monotonic(), round(seconds / CONTROL_DT)
+    for t in range(T):
         poses.append(env.world.bind("qpos").copy())
         contacts.append(env.world.bind("sensordata")[:, feet] > 0)
         if seen is not None:
@@ -66,6 +79,7 @@ def take_a_walk(policy, robot, faults, speed, seconds, seed=0, threads=0, seen=N
         returns += upright * reward
         upright &= ~terminated
         steps += upright
+        show_progress(label, t + 1, T, began)
         if not upright.any():
             break
     if divergences:
@@ -99,7 +113,8 @@ def walk_cases(
     faults = [cases[case] for case, _ in labels]
     how, rows = (speed, args.seconds, args.seed, args.threads), []
     for path, (policy, card) in policies.items():
-        walk = take_a_walk(policy, args.robot, faults, *how, **sim)
+        label = f"{card['policy']}, seed {card['seed']}, {', '.join(cases)}"[:60]
+        walk = take_a_walk(policy, args.robot, faults, *how, label=label, **sim)
         healthy = [i for i, fault in enumerate(faults) if fault == HEALTHY]
         duties = dict(zip(walk.env.robot.legs, duty(walk, healthy)))
         for i, (case, episode) in enumerate(labels):
@@ -112,7 +127,6 @@ def walk_cases(
                 "leg_duty": f"{min(used, default=1.0):.2f}",
                 "episode_return": f"{walk.returns[i]:.4f}",
             } | measure(walk, i))  # fmt: skip
-        print(f"  {card['policy']}, seed {card['seed']}: done", flush=True)
     return rows
 
 
