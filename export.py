@@ -27,14 +27,14 @@ from rolt import HISTORY, SCAN_SHAPE, Observation
 
 FRAME = "for each step, oldest first, and leg: joint angles beyond default_pose [rad], velocities \
 [rad/s], previous action; command: forward, left [m/s], yaw [rad/s]; trunk's linear velocity \
-[m/s], angular velocity [rad/s] and direction of gravity less (0, 0, -1), in the trunk's frame. Signs: \
-joint_sign on angles and velocities, trunk_sign on the last twelve; scales: joint_scale (angle, \
-velocity, action), trunk_scale. At the start every step is the first"
+[m/s], angular velocity [rad/s] and direction of gravity less (0, 0, -1), in the trunk's frame. \
+Signs: joint_sign on angles and velocities, trunk_sign on the last twelve; scales: joint_scale \
+(angle, velocity, action), trunk_scale. At the start every step is the first"
 MEANING = {
     "legs": FRAME,
     "action": "the previous actions, leg by leg",
     "heights": f"{HEIGHT_SCALE:g} clip(trunk z - {TRUNK_HEIGHT} m - ground z, -1, 1) on a level "
-    f"grid around the trunk that turns with it, {SPACING} m apart; from rear to front, right to left",
+    f"grid around the trunk, turning with it, {SPACING} m apart; from rear to front, right to left",
     "past": f"as legs, {LONG_HISTORY} steps",
 }
 

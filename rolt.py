@@ -137,6 +137,12 @@ class ROLT(nn.Module):
         self.extras = ("heights",) if config.scan else ()  # that it reads, see env.py
         self.leg_frames = config.leg_frames
 
+        self.others = {}  # tokens beside the legs', in their order
+        if config.identity == "action":
+            self.others["action"] = 1
+        if config.scan:
+            self.others["patches"] = NUM_PATCHES
+
         D = config.width
         inputs = HISTORY * (3 * num_joints + 12)  # numbers that one leg sees
         self.leg_embedding = nn.Sequential(nn.Linear(inputs, D), nn.ReLU(), nn.Linear(D, D))
@@ -203,9 +209,7 @@ class ROLT(nn.Module):
 
     def _queries(self, layer: int) -> int:
         """How many tokens a layer updates: those read afterwards; after the last, only the legs."""
-        if layer == self.config.layers - 1:
-            return self.num_legs
-        return self.num_legs + (self.config.identity == "action") + NUM_PATCHES * self.config.scan
+        return self.num_legs + sum(self.others.values()) * (layer < self.config.layers - 1)
 
     def _encode(self, observation, masks: Masks) -> tuple[Tensor, Tensor]:
         """The leg tokens after the last layer (B, L, D), and its attention (B, heads, L, T)."""

@@ -301,7 +301,7 @@ class Progress:
             f" | speed {row['speed']:.2f} of {row['commanded_speed']:.2f} m/s std {row['std']:.2f}"
         )
         if episodes:
-            line += f" return {returns:.1f} episode {row['episode_seconds']:.1f} s falls {falls:.0%}"
+            line += f" return {returns:.1f} falls {falls:.0%} after {row['episode_seconds']:.1f} s"
         if sys.stdout.isatty():
             print(f"\r{line}\033[K", end="", flush=True)
         elif row["iteration"] % 10 == 1:  # not to fill a log

@@ -25,9 +25,10 @@ from PIL import Image
 
 from checkpoint import load_policy
 from env import CONTROL_DT, LocomotionEnv
-from faults import REAL_WORLD, TASKS, faulty_model, first_task, harms_of, props
+from faults import REAL_WORLD, TASKS, fault_now, faulty_model, first_task, harms_of, props
 from ppo import to_tensors
 from robots import ROBOTS
+from rolt import ROLT
 from terrain import Terrain
 from walk import straight_ahead, take_a_walk
 
@@ -52,7 +53,7 @@ def film(args, policy, terrain: Terrain | None) -> None:
     steps = range(round(2 / CONTROL_DT), walk.steps[0], 2)
     if not steps:
         raise RuntimeError(f"with {args.fault} the robot falls within 2 s: nothing to show")
-    model = painted(walk.env, args.fault)
+    model, colours = painted(walk.env, "healthy"), {}
     try:
         if NO_DISPLAY and "MUJOCO_GL" not in os.environ:  # MuJoCo would look for a window
             from mujoco import egl
@@ -68,6 +69,10 @@ def film(args, policy, terrain: Terrain | None) -> None:
     camera.elevation = -18
     camera.azimuth = 60 if terrain else 125  # from behind, stairs show their steps
     for step in steps:
+        now = fault_now(args.fault, step, (args.seed, 0, 1))
+        if now not in colours:
+            colours[now] = painted(walk.env, now).geom_rgba
+        model.geom_rgba[:] = colours[now]
         data.qpos[:] = walk.poses[step, 0]
         mujoco.mj_fwdPosition(model, data)
         camera.lookat[:] = data.qpos[:3] - [0, 0, 0.08]  # on flat ground 0.2 m up
@@ -89,6 +94,7 @@ class Show:
         self.policy, self.robot, self.speed = policy, robot, speed
         self.seed, self.terrain = seed, terrain
         self.words, self.said, self.over = queue.Queue(), HELP, False
+        self.terms, self.attention = {}, {}  # of the last step: rewards, and where legs look
         self.start(fault, noise)
 
     def start(self, fault: str, noise: str) -> None:
@@ -96,9 +102,15 @@ class Show:
         config = straight_ahead(self.policy, self.speed, 3600)
         options = (config, self.policy.extras, self.terrain, noise)
         env = LocomotionEnv(self.robot, 1, self.seed, 1, [(1.0, fault)], *options)
-        observation, model = env.reset(), painted(env, fault)
+        env.pin_faults([fault])
+        observation = env.reset()
         self.env, self.observation, self.fault, self.noise = env, observation, fault, noise
-        self.model, self.data = model, mujoco.MjData(model)
+        self.repaint()
+        self.data = mujoco.MjData(self.model)
+
+    def repaint(self) -> None:
+        self.shown = self.env.fault_now[0]
+        self.model = painted(self.env, self.shown)
 
     def set_fault(self, fault: str) -> None:
         """Without a reset, unless a box or wheels come or go. ValueError: there is no such part."""
@@ -108,7 +120,8 @@ class Show:
         self.env.pin_faults([fault])  # at the next resets, too
         self.env.age[:] = self.env.first_age[:] = 0  # its times count from now on
         self.env._strike([0])
-        self.fault, self.model = fault, painted(self.env, self.env.fault_now[0])
+        self.fault = fault
+        self.repaint()
 
     def hear(self, word: str) -> None:
         """A word of those in HELP. What it cannot read changes nothing, and `said` tells why."""
@@ -134,10 +147,18 @@ class Show:
         while not self.words.empty():
             self.hear(self.words.get().strip())
         self.env.command[:, 0] = self.speed
-        action = self.policy(to_tensors(self.observation, "cpu")).numpy()
-        self.observation, _, fallen, _, _ = self.env.step(action)
+        seen = to_tensors(self.observation, "cpu")
+        self.observation, _, fallen, _, info = self.env.step(self.policy(seen).numpy())
+        self.terms = {name: x[0] for name, x in info["rewards"].items()}
+        if isinstance(self.policy, ROLT):
+            weights = self.policy.attention(seen)[0].mean(0)  # over heads: (L, T)
+            parts = weights.split([len(weights), *self.policy.others.values()], dim=1)
+            shares = [part.sum(1).tolist() for part in parts]
+            self.attention = dict(zip(("legs", *self.policy.others), shares))
         if fallen[0]:
             print("it fell and starts over", flush=True)
+        if self.env.fault_now[0] != self.shown:
+            self.repaint()
         self.data.qpos[:] = self.env.world.bind("qpos")[0]
         self.data.time += CONTROL_DT
 
@@ -154,7 +175,7 @@ def view(show: Show, public: bool, port: int) -> None:
     class Panel(plugin.ViewerPlugin):
         """Runs in the viewer's thread, so it only reads the show and puts words in its queue."""
 
-        text = show.fault
+        text, size = show.fault, imgui.Vec2(-1, 0)  # as wide as the panel
 
         @messages.handler
         def aim(self, _: messages.PostModelEvent) -> None:
@@ -181,6 +202,13 @@ def view(show: Show, public: bool, port: int) -> None:
                 imgui.SameLine()
                 if imgui.Button("again"):
                     show.words.put("again")
+                if imgui.CollapsingHeader("rewards a second"):
+                    for name, value in show.terms.items():  # 2 is all that tracking can earn
+                        imgui.ProgressBar(abs(value) / 2, self.size, f"{name} {value:+.2f}")
+                if show.attention and imgui.CollapsingHeader("attention"):
+                    for part, shares in show.attention.items():
+                        for leg, share in zip(show.env.robot.legs, shares):
+                            imgui.ProgressBar(share, self.size, f"{leg} on {part} {share:.0%}")
             imgui.End()
 
     gfx = "web" if public else ""

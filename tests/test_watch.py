@@ -83,3 +83,14 @@ def test_nothing_but_the_faulty_leg_is_painted(show):
     plain, painted = show.env.model, watch.painted(show.env, "lock:FR_calf")
     changed = (plain.geom_rgba != painted.geom_rgba).any(axis=1)
     assert {plain.body(body).name for body in plain.geom_bodyid[changed]} == {"FR_calf"}
+
+
+def test_it_tells_what_is_earned_and_where_legs_look_and_paints_what_is_broken(show):
+    show.hear("lock:RL_calf@0.04:0.08")
+    red = []
+    for _ in range(6):
+        show.step()
+        red.append(bool((show.model.geom_rgba[:, 0] == np.float32(0.85)).any()))
+    assert red == [False, False, True, True, False, False]
+    assert len(show.terms) == 9 and [*show.attention] == ["legs", "action", "patches"]
+    assert np.sum([*show.attention.values()], axis=0) == pytest.approx([1] * 4, abs=1e-5)
