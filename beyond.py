@@ -19,7 +19,7 @@ from env import CONTROL_DT
 from faults import HEALTHY, TASKS
 from report import by_seed, mean_and_interval, report, scores
 from robots import ROBOTS
-from walk import Walk, walk_cases, write_csv
+from walk import Walk, read_csv, walk_cases, write_csv
 
 SPEED = 0.75  # m/s, the paper's
 STRIKE, END = 5.0, 12.0  # s
@@ -47,12 +47,17 @@ def curves(args, policies) -> None:
 
 
 def growth(args, policies) -> None:
-    """Success on what was never seen, against the steps of training."""
+    """Success on what was never seen, against the steps of training. What growth.csv holds of other
+    runs stays in it: snapshots are too many to keep."""
     rows = walk_cases(args, policies, {fault: fault for fault in TASKS[args.task].unseen}, SPEED)
     steps = {str(path): card["steps"] for path, (_, card) in policies.items()}
     for row in rows:
-        row |= {"fault": row["case"], "method": row["method"].split()[0]}
+        row |= {"fault": row["case"], "method": row["method"].split()[0], "seed": str(row["seed"])}
         row["case"] = f"{steps[row['checkpoint']] / 1e6:.1f}"
+    if (path := args.out / "growth.csv").exists():
+        new = {(row["method"], row["seed"]) for row in rows}
+        old = read_csv(path)
+        rows = [row for row in old if (row["method"], row["seed"]) not in new] + rows
     rows.sort(key=lambda row: float(row["case"]))
     columns = {"success": "success on unseen faults", "share": "share of the distance"}
     report(args, rows, columns, f"Growth: {args.robot}", x="env steps [million]")

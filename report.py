@@ -8,7 +8,6 @@ by a bootstrap of seeds and of episodes within each. Comparisons over many cases
 file (walk.py); S seeds, C cases.
 """
 
-import csv
 import math
 from itertools import combinations
 from pathlib import Path
@@ -17,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 import plots
-from walk import write_csv
+from walk import read_csv, write_csv
 
 DRAWS = 2000
 SEEDS = 3  # ours: fewer give no verdict
@@ -213,10 +212,7 @@ def claims(folder: Path) -> None:
     print(f"| {' | '.join(columns)} |\n{'|---' * len(columns)}|")
     for claim in CLAIMS:
         path = folder / f"{claim.test}.csv"
-        rows = []
-        if path.exists():
-            with open(path, newline="") as file:
-                rows = list(csv.DictReader(file))
+        rows = read_csv(path) if path.exists() else []
         there = {row["method"] for row in rows}
         for other in claim.against:
             line = f"| {claim.text} | {claim.test}, {claim.measure} "

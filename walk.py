@@ -130,6 +130,11 @@ def walk_cases(
     return rows
 
 
+def read_csv(path: Path) -> list[dict]:
+    with open(path, newline="") as file:
+        return list(csv.DictReader(file))
+
+
 def write_csv(path: Path, rows: list[dict], mode: str = "w") -> None:
     """mode "a": adds rows to those in the file."""
     with open(path, mode, newline="") as file:
