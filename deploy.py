@@ -21,8 +21,8 @@ assert [x["name"] for x in card["inputs"]] == ["legs", "action"], "this one walk
 
 data, action, history = mujoco.MjData(model), np.zeros_like(default), None
 mujoco.mj_resetDataKeyframe(model, data, 0)
-mujoco.mj_forward(model, data)
 for _ in range(round(10 / card["control_dt"])):
+    mujoco.mj_forward(model, data)
     # what a leg sees: its joints, and the trunk, a left leg all of it mirrored
     rotation = data.body("trunk").xmat.reshape(3, 3)
     yaw = np.arctan2(rotation[1, 0], rotation[0, 0])

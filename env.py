@@ -144,8 +144,8 @@ class LocomotionEnv:
 
     def pin_faults(self, faults: list[str]) -> None:
         """Robot i has faults[i] in every episode from its next reset on, for tests."""
-        self.faults, self.fault_index, self._pinned = list(faults), np.arange(self.num_envs), True
         self.fault_writer.expect(faults)
+        self.faults, self.fault_index, self._pinned = list(faults), np.arange(self.num_envs), True
 
     def reset(self, random_ages: bool = False) -> Observation:
         """Starts an episode on every robot. `random_ages`: their ends are spread (legged_gym)."""
@@ -230,7 +230,8 @@ class LocomotionEnv:
         """All that the next step depends on but noise on the scan. Tensors: safe for torch.load."""
         arrays = {name: getattr(self, name) for name in SAVED}
         arrays |= {"world": self.world.state, "friction": self._friction}
-        arrays |= self.fault_writer.state_dict()
+        writer = self.fault_writer  # where what has struck is held
+        arrays |= {"held": writer.senses.held, "eq_data": writer.values["eq_data"]}
         tensors = {name: torch.tensor(array) for name, array in arrays.items()}  # copies
         return tensors | {"random": self.rng.bit_generator.state}
 
@@ -240,7 +241,8 @@ class LocomotionEnv:
             getattr(self, name)[...] = state[name]
         self.rng.bit_generator.state = state["random"]
         self._strike(range(self.num_envs), anew=True, ago=1)  # what was so in the last step
-        self.fault_writer.load_state_dict(state)
+        self.fault_writer.senses.held[...] = state["held"]
+        self.fault_writer.values["eq_data"][...] = state["eq_data"]
         self._friction[...] = state["friction"]
         self.world.state[...] = state["world"]
         self.world.forward(stage=mujoco.mjtStage.mjSTAGE_VEL)
@@ -283,8 +285,8 @@ class LocomotionEnv:
         self.history[ids] = self._frame()[ids, :, None]  # as though it had always stood like this
 
     def _strike(self, ids, anew: bool = False, ago: int = 0) -> None:
-        """Gives the robots `ids` what is wrong at this step, or was so `ago` steps before; anew:
-        even if it is what they have."""
+        """Gives the robots `ids` what is wrong at this step; anew: even if it is what they have;
+        ago 1, at a resume: what was so in the last step, so that what begins now strikes."""
         for i in ids:
             luck, age = (*self._luck, i, self.episode[i]), self.age[i] - self.first_age[i]
             now = fault_now(self.faults[self.fault_index[i]], max(0, age - ago), luck)
@@ -348,11 +350,9 @@ class LocomotionEnv:
 
     def _frame(self) -> np.ndarray:
         """(N, L, 21), the newest step of every leg's history."""
-        seen = self.joint_error, self.joint_velocity
-        seen += self.linear_velocity, self.angular_velocity, self.gravity
-        if self.fault_writer.senses is not None:
-            seen = self.fault_writer.senses.read(*seen)
-        angle, velocity, linear, angular, gravity = seen
+        seen = self.joint_error, self.joint_velocity, self.linear_velocity, self.angular_velocity
+        sensed = self.fault_writer.senses.read(*seen, self.gravity)
+        angle, velocity, linear, angular, gravity = sensed
         joints = self._joint_sign * angle, self._joint_sign * velocity, self.action
         joints = JOINT_SCALE * np.stack(joints, axis=2)  # (N, L, 3, J)
         trunk = np.concatenate([self.command, linear, angular, gravity - (0, 0, -1)], axis=1)

@@ -1,7 +1,7 @@
 """Takes a policy away: a program for torch.export, the robot's model, and a contract in words.
 
     python export.py checkpoints/a1-stiffness-rolt.pt exported
-    python deploy.py exported      # walks, with plain MuJoCo and numpy
+    python deploy.py exported      # walks, with MuJoCo, numpy and torch alone
 
 OUT gets policy.pt2 (actions from inputs, any number of robots), robot.mjb (MuJoCo's model) and
 policy.json (order, meaning and scale of every input and of the actions). What the program answers
@@ -19,7 +19,7 @@ from torch import nn
 
 from baselines import ROAM
 from checkpoint import load_policy
-from env import JOINT_SCALE, LONG_HISTORY, MAX_ACTION, TRUNK_SCALE, LocomotionEnv
+from env import JOINT_SCALE, LONG_HISTORY, MAX_ACTION, TRUNK_SCALE, EnvConfig, LocomotionEnv
 from noise import HEIGHT_SCALE, SPACING, TRUNK_HEIGHT
 from ppo import to_tensors
 from robots import CONTROL_DT, PHYSICS_DT
@@ -74,7 +74,8 @@ def export(path: Path, out: Path) -> None:
     policy, card = load_policy(path)
     if isinstance(policy, ROAM):
         raise ValueError("ROAM draws its behaviour at random, which no program can repeat")
-    env = LocomotionEnv(card["robot"], 3, num_threads=1, extras=policy.extras)
+    config = EnvConfig(leg_frames=policy.leg_frames)
+    env = LocomotionEnv(card["robot"], 3, num_threads=1, config=config, extras=policy.extras)
     observation = to_tensors(env.reset(), "cpu")
     inputs = {x: getattr(observation, x) for x in ("legs", "action", *policy.extras)}
 

@@ -12,7 +12,7 @@ A fault is words, the same in code, options, tables and checkpoints, which add u
 and, beyond the paper, what is ours:
     late:FR:0.02      motors answer 0.02 s later, at most 0.04 (in steps of the simulation, 5 ms)
     payload:trunk:2   2 kg more, in the middle of the trunk (or of a link)
-    blow:trunk:5      a push of 5 N s to the left, -5 to the right, within one control step
+    blow:trunk:5@3:   a push of 5 N s to the left, -5 to the right, within the step at 3 s
     freeze:FR_calf    angle and velocity read as they were when it began
     bias:FR:0.2       the angles read 0.2 rad more
     mute:FR           angle and velocity read as of one at rest in the default pose
@@ -20,7 +20,8 @@ and, beyond the paper, what is ours:
     odometry:trunk:0.5    half of the velocity is sensed; 0 = none
 The last five change what policies see, neither the physics nor the rewards. A word may say when, in
 seconds of the episode:
-    lock:FR_calf@5:12    from 5 s to 12 s, @5: from then on. A lock that strikes holds where it is.
+    lock:FR_calf@5:12    from 5 s to 12 s; lock:FR_calf@5: (with the colon) from 5 s to the end. A
+                         lock that strikes in mid-episode holds where it is.
     lock:FR_calf@0.3/2   for 0.3 s of every 2 s, at a moment drawn anew each time
 
 `faulty_model` does to a MuJoCo model what the words say; `FaultWriter` copies what has changed
@@ -47,7 +48,6 @@ KINDS = {
     "bias": (-7, 7), "mute": None, "imu": (-1.5, 1.5), "odometry": (0, 2),
 }  # fmt: skip
 MOTORS = ("lock", "disable", "weaken")  # a critic reads these off the simulation
-SENSES = ("freeze", "bias", "mute", "imu", "odometry")
 HEALTHY = "healthy"
 
 
@@ -56,7 +56,7 @@ class Harm(NamedTuple):
 
     kind: str  # of KINDS
     part: str  # a joint, a leg, a body
-    size: float  # as said above; of a lock and a dead motor, too, the share of torque left
+    size: float  # the word's number; 0 if it has none, so locks and dead motors scale torque by 0
     word: str  # all of it but for the time
     first: int = 0  # step
     last: float = math.inf  # step at which it has ended
@@ -86,7 +86,7 @@ def harms_of(fault: str) -> tuple[Harm, ...]:
             if bounds and not bounds[0] <= float(size) <= bounds[1]:
                 raise ValueError(f"the number of {kind} is from {bounds[0]} to {bounds[1]}")
             harms.append(Harm(kind, part, float(size), word, *_steps(when, kind) if at else ()))
-        except (KeyError, ValueError) as error:  # no such kind, too few or too many, bad number
+        except (KeyError, ValueError, OverflowError) as error:  # no such kind, a bad number
             kinds = ", ".join(KINDS)
             right = f"write healthy or {kinds}, as in lock:FR_calf+weaken:RL:0.5@5:12"
             raise ValueError(f"cannot read the fault {text!r} ({error}); {right}") from None
@@ -184,9 +184,10 @@ class Senses:
         self.frozen, self.held = np.zeros((N, 1, K), dtype=bool), np.zeros((N, 2, K))
         self.pitch, self.speed = np.zeros(N), np.ones((N, 1))  # rad, share
 
-    def write(self, fault: str, i: int, robot: Robot) -> None:
-        """Robot i's fail so, and else not. What freezes is held from the next `read` on."""
-        was, self.frozen[i] = self.frozen[i].copy(), False
+    def write(self, fault: str, i: int, robot: Robot, anew: bool) -> None:
+        """Robot i's fail so, and else not. What freezes is held from the next `read` on; anew: also
+        what was frozen before."""
+        was, self.frozen[i] = self.frozen[i] & (not anew), False
         self.gain[i] = self.speed[i] = 1
         self.bias[i] = self.pitch[i] = 0
         for kind, part, size, *_ in harms_of(fault):
@@ -218,16 +219,21 @@ class FaultWriter:
     def __init__(self, robot: Robot, world: Batch, faults: list[str]):
         self.robot, self.world = robot, world
         self.models: dict[str, mujoco.MjModel] = {}  # of each fault that was met
-        self.values: dict[str, np.ndarray] = {}  # {field: (N, ...)}, of all that some fault changes
-        self.senses, self.pushes = None, None  # until some fault needs them
+        # {field: (N, ...)}, of all that some fault changes; where locks hold, too
+        self.values: dict[str, np.ndarray] = {"eq_data": world.expand("eq_data")}
+        self.pushes = world.bind("xfrc_applied")  # (N, bodies, 6) N, N m
+        self.senses = Senses(world.nsim, len(robot.joints))
         self.expect(faults)
 
     def expect(self, faults: list[str]) -> None:
         """Which may come: whose time comes later is checked now (ValueError), and what critics are
         told is of these: `told` (N, M), the sizes of `other_harms`."""
         self.timed = np.array(["@" in fault for fault in faults])
-        for fault in np.array(faults)[self.timed]:
-            self.model("+".join(harm.word for harm in harms_of(str(fault))))
+        for fault in faults:
+            if any(harm.kind == "blow" and harm.last == math.inf for harm in harms_of(fault)):
+                raise ValueError(f"when is the blow of {fault}? As in blow:trunk:5@3:")
+            if "@" in fault:
+                self.model("+".join(harm.word for harm in harms_of(fault)))
         self.columns = other_harms(faults)
         self.told = np.zeros((self.world.nsim, len(self.columns)))
 
@@ -245,41 +251,23 @@ class FaultWriter:
 
     def write(self, fault: str, i: int, angles: np.ndarray | None = None) -> None:
         """Makes robot i healthy but for `fault`, or raises ValueError, writing nothing. angles:
-        (L*J,) rad, at which a lock holds (default: the default pose's)."""
-        world, model, harms = self.world, self.model(fault), harms_of(fault)
-        locked = model.eq_active0.astype(bool) & (angles is not None)
-        if locked.any():
-            self.values["eq_data"] = world.expand("eq_data")
+        (L*J,) rad, where joints are if it strikes in mid-episode: there new locks hold."""
+        model, seats = self.model(fault), self.values["eq_data"][i, :, 0].copy()
+        held = self.world.bind("eq_active")[i] > 0
         for name, values in self.values.items():
             values[i] = getattr(model, name)
-        if locked.any():
-            self.values["eq_data"][i, locked, 0] = angles[locked]
+        if angles is not None:
+            locked = model.eq_active0 > 0
+            self.values["eq_data"][i, locked, 0] = np.where(held, seats, angles)[locked]
 
-        blows = [harm for harm in harms if harm.kind == "blow"]
-        if blows or self.pushes is not None:
-            self.pushes = world.bind("xfrc_applied")  # (N, bodies, 6) N, N m
-            self.pushes[i] = 0
-            for _, part, size, *_ in blows:
+        self.pushes[i] = self.told[i] = 0
+        for kind, part, size, *_ in harms_of(fault):
+            if kind == "blow":
                 self.pushes[i, model.body(part).id, 1] += size / CONTROL_DT
-        if self.senses is None and any(harm.kind in SENSES for harm in harms):
-            self.senses = Senses(world.nsim, len(self.robot.joints))
-        if self.senses is not None:
-            self.senses.write(fault, i, self.robot)
-        sizes = {harm[:2]: harm.size or 1.0 for harm in harms}
-        self.told[i] = [sizes.get(column, 0.0) for column in self.columns]
-
-    def state_dict(self) -> dict[str, np.ndarray]:
-        """What `write` would not find again: where what has struck is held."""
-        state = {"held": self.senses.held} if self.senses else {}
-        return state | {"eq_data": self.values["eq_data"]} if "eq_data" in self.values else state
-
-    def load_state_dict(self, state: dict) -> None:
-        """The inverse, after all faults have been written."""
-        if "eq_data" in state:
-            self.values["eq_data"] = self.world.expand("eq_data")
-            self.values["eq_data"][:] = state["eq_data"]
-        if "held" in state:
-            self.senses.held[:] = state["held"]
+            if (kind, part) in self.columns:
+                lost = 1 - size if kind == "odometry" else size if KINDS[kind] else 1.0
+                self.told[i, self.columns.index((kind, part))] += lost
+        self.senses.write(fault, i, self.robot, anew=angles is None)
 
 
 @dataclass(frozen=True)

@@ -3,9 +3,9 @@
     python evaluate.py claims    # from the CSV files that the tests have left in --out
 
 The unit is the seed: it stands for a training, an episode only for a start. Intervals are of 95 %,
-by a bootstrap of seeds and of episodes within each. Comparisons over many cases are rliable's
-(Agarwal et al. 2021): interquartile mean and probability of improvement. `rows` are those of a CSV
-file (walk.py); S seeds, C cases.
+by a bootstrap of seeds and of episodes within each; with three seeds that is little more than their
+range. Comparisons over many cases are rliable's (Agarwal et al. 2021): interquartile mean and
+probability of improvement. `rows` are those of a CSV file (walk.py); S seeds, C cases.
 """
 
 import math
@@ -87,6 +87,11 @@ def trained(rows: list[dict], method: str) -> bool:
     return True
 
 
+def uses(rows: list[dict], method: str, case: str) -> bool:
+    """Do all seeds of the method walk on the leg that this case harms?"""
+    return min(min(x) for x in by_seed(rows, "leg_duty", method=method, case=case)) >= USED
+
+
 def scores(rows: list[dict], method: str, cases: list[str], column="share") -> np.ndarray:
     """(S, C), each the mean over episodes."""
     values = [by_seed(rows, column, method=method, case=case) for case in cases]
@@ -94,9 +99,14 @@ def scores(rows: list[dict], method: str, cases: list[str], column="share") -> n
 
 
 def compare(rows: list[dict], groups: dict[str, list[str]], best: str = "rolt") -> None:
-    """Prints a table over groups of cases: shares of the commanded distance."""
-    methods = [*dict.fromkeys(row["method"] for row in rows)]
+    """Prints a table over groups of cases: shares of the commanded distance, of the methods that are
+    trained, in cases whose leg all of them use."""
+    methods = [m for m in dict.fromkeys(row["method"] for row in rows) if trained(rows, m)]
     for name, cases in groups.items():
+        cases = [case for case in cases if all(uses(rows, m, case) for m in methods)]
+        if not cases:
+            continue
+        name += f" ({', '.join(cases)})"
         print(f"\n| {name} | IQM of the share walked | {best} is better | p |\n|---|---|---|---|")
         ours = scores(rows, best, cases) if best in methods else None
         for method in methods:
@@ -170,40 +180,37 @@ CLAIMS = (
 )  # fmt: skip
 
 
-def measured(rows: list[dict], method: str, claim: Claim) -> list[np.ndarray]:
-    """The claim's measure of each seed's episodes, where the leg is one that the method uses.
-    upright: no fall; kept: the share walked, over the seed's own without noise."""
-    def chosen(row: dict) -> bool:
-        wanted = row["case"] in claim.cases if claim.cases else not int(row["seen"])
-        return row["method"] == method and wanted and float(row["leg_duty"]) >= USED
-
-    rows, whole = [row for row in rows if chosen(row)], rows
+def measured(rows: list[dict], method: str, claim: Claim, cases: list[str]) -> list[np.ndarray]:
+    """The claim's measure of each seed's episodes. upright: no fall; kept: the share walked, over
+    the seed's own without noise."""
+    some = [row for row in rows if row["method"] == method and row["case"] in cases]
     if claim.measure == "upright":
-        return [1 - fell for fell in by_seed(rows, "fell")]
+        return [1 - fell for fell in by_seed(some, "fell")]
     if claim.measure == "kept":
-        clean = [row for row in whole if row["method"] == method and int(row["seen"])]
-        pairs = zip(by_seed(rows, "share"), by_seed(clean, "share"))
+        clean = [row for row in rows if row["method"] == method and int(row["seen"])]
+        pairs = zip(by_seed(some, "share"), by_seed(clean, "share"))
         return [noisy / clean.mean() for noisy, clean in pairs]
-    return by_seed(rows, claim.measure)
+    return by_seed(some, claim.measure)
 
 
-def judge(ours: list[np.ndarray], theirs: list[np.ndarray]) -> tuple[str, str, str]:
-    """The difference with its interval, the verdict, and how many seeds would decide (if the
-    difference and the spread of the seeds stay what they are)."""
-    rng = np.random.default_rng(0)
-    low, high = interval(bootstrap(ours, rng) - bootstrap(theirs, rng))
-    a, b = (np.array([x.mean() for x in seeds]) for seeds in (ours, theirs))
-    gap, fixed = a.mean() - b.mean(), len(b) == 1 and len(theirs[0]) == 1  # against a number
-    enough = min(len(a), math.inf if fixed else len(b)) >= SEEDS
+def judge(ours: list[np.ndarray], theirs: list[np.ndarray] | float) -> tuple[str, str, str]:
+    """The difference with its interval, the verdict (decided where the two intervals are apart), and
+    how many seeds would decide if the difference and the spread of the seeds stay what they are."""
+    number, rng = isinstance(theirs, float), np.random.default_rng(0)
+    draws = [bootstrap(ours, rng), np.full(DRAWS, theirs) if number else bootstrap(theirs, rng)]
+    (low, high), (their_low, their_high) = map(interval, draws)
+    a = np.array([x.mean() for x in ours])
+    b = np.array([theirs] if number else [x.mean() for x in theirs])
+    gap, enough = a.mean() - b.mean(), len(a) >= SEEDS and (number or len(b) >= SEEDS)
     verdict = "undecided"
-    if enough and not low <= 0 <= high:
+    if enough and (low > their_high or high < their_low):
         verdict = "shows" if gap > 0 else "does not"
-    needed = f"{SEEDS}"
-    if enough:
-        spread = a.var(ddof=1) + (0 if fixed else b.var(ddof=1))
-        needed = f"{max(SEEDS, math.ceil(1.96**2 * spread / gap**2))}" if gap else "more"
-    words = f"{gap:+.2f} ({low:+.2f} to {high:+.2f})"
-    return words, verdict, needed if verdict == "undecided" else "-"
+    needed = "-" if verdict != "undecided" else f"{SEEDS}"
+    if enough and verdict == "undecided":
+        spread = a.std(ddof=1) + (0 if number else b.std(ddof=1))
+        needed = f"{max(SEEDS, math.ceil((1.96 * spread / gap) ** 2))}" if gap else "more"
+    low, high = interval(draws[0] - draws[1])
+    return f"{gap:+.2f} ({low:+.2f} to {high:+.2f})", verdict, needed
 
 
 def claims(folder: Path) -> None:
@@ -223,8 +230,13 @@ def claims(folder: Path) -> None:
             if why:
                 print(line + f"| | {other} | | | {', '.join(why)} | - |")
                 continue
-            ours = measured(rows, "rolt", claim)
-            theirs = [np.array([other])] if number else measured(rows, other, claim)
+            unseen = dict.fromkeys(row["case"] for row in rows if not int(row["seen"]))
+            cases = [x for x in claim.cases or unseen if all(uses(rows, m, x) for m in methods)]
+            if not cases:
+                print(line + f"| | {other} | | | no leg that both use | - |")
+                continue
+            ours = measured(rows, "rolt", claim, cases)
+            theirs = other if number else measured(rows, other, claim, cases)
             mean, low, high = mean_and_interval(ours)
             gap, verdict, needed = judge(ours, theirs)
             seeds = f"{len(ours)}" if number else f"{len(ours)}, {len(theirs)}"

@@ -14,7 +14,6 @@ processes of one thread run nearly twice as fast as one process of two threads.
 """
 
 import argparse
-import csv
 import math
 import os
 import signal
@@ -47,11 +46,6 @@ def parse_arguments(argv: list[str] | None = None):
             raise ValueError
         return int(float(text))
 
-    def file(text: str) -> Path:
-        if not text:
-            raise ValueError
-        return Path(text)
-
     devices = ("cpu", "cuda") if torch.cuda.is_available() else ("cpu",)
     style = {"formatter_class": argparse.RawDescriptionHelpFormatter, "usage": argparse.SUPPRESS}
     parser = argparse.ArgumentParser(description=__doc__, **style)
@@ -65,12 +59,12 @@ def parse_arguments(argv: list[str] | None = None):
     add("--minibatches", type=count, default=PPOConfig.minibatches, help="an epoch")
     add("--paper", action="store_true", help="4096 robots, 400M steps, 5 epochs of 4 minibatches")
     add("--scan", action="store_true", help="the height scan on flat ground, too (as in the paper)")
-    add("--init", type=file, help="a policy.pt or checkpoint.pt to start from: flat, then stairs")
+    add("--init", metavar="FILE", help="a policy.pt or checkpoint.pt to start from: flat, then stairs")
     add("--seed", type=int, default=0)
     add("--device", choices=devices, default=devices[-1], help="default: cuda if there is one")
     add("--precision", choices=("auto", "fp32", "bf16"), default="auto", help="auto: bf16 if fast")
     add("--threads", type=count, help="cores to use (default: all, or as many as divide --envs)")
-    add("--out", type=file, help="folder of the run (default: runs/ROBOT-TASK-POLICY-seedN)")
+    add("--out", help="folder of the run (default: runs/ROBOT-TASK-POLICY-seedN)")
     add("--resume", action="store_true", help="go on from the checkpoint in that folder")
     add("--save-minutes", type=float, default=3.0, help="time between two checkpoints")
     args = parser.parse_args(argv)
@@ -81,7 +75,10 @@ def parse_arguments(argv: list[str] | None = None):
     args.task = args.task or first_task(args.robot)
     task = TASKS[args.task]
     args.scan |= task.terrain is not None
-    args.out = args.out or Path(f"runs/{args.robot}-{args.task}-{args.policy}-seed{args.seed}")
+    if "" in (args.out, args.init):
+        parser.error("the name of a file or folder is empty")
+    name = f"{args.robot}-{args.task}-{args.policy}-seed{args.seed}"
+    args.out = Path(args.out or f"runs/{name}")
     if args.robot not in task.robots:
         parser.error(f"the task {args.task} is for {', '.join(task.robots)}, not for {args.robot}")
 
@@ -95,7 +92,6 @@ def parse_arguments(argv: list[str] | None = None):
     if args.threads is None:
         cores = len(os.sched_getaffinity(0)) if sys.platform == "linux" else os.cpu_count()
         args.threads = max(n for n in range(1, cores + 1) if cuda or args.envs % n == 0)
-    args.init = args.init and str(args.init)
     torchrun = dist.is_torchelastic_launched()
     args.processes = int(os.environ["WORLD_SIZE"]) if torchrun else 1 if cuda else args.threads
     if args.envs % args.processes:
@@ -193,7 +189,8 @@ def train(rank: int, args, sync: str) -> None:
             content = options | {"steps": steps, "stages": lengths, "options": options}
             content |= {name: part.state_dict() for name, part in run.parts.items()}
             content |= {"stage": run.number, "iteration": iteration, "processes": everyone}
-            content["torch"], content["curve"] = torch.get_rng_state(), progress.curve()
+            content |= {"torch": torch.get_rng_state(), "rows": progress.rows}
+            content["curve"] = progress.curve()
             checkpoint.save(content, args.out / "checkpoint.pt")
             checkpoint.save_policy(content, args.out / "policy.pt")
             if snapshot:  # to see how a policy grew
@@ -201,7 +198,7 @@ def train(rank: int, args, sync: str) -> None:
             learning_curve(progress.rows, args.out / "progress.png")
 
     if rank == 0:
-        progress = Progress(args.out / "progress.csv", iteration, steps, ends[-1])
+        progress = Progress(args.out / "progress.csv", saved.get("rows", []), ends[-1])
     saved_at, stop = time.monotonic(), False
     while steps < ends[-1] and not stop:
         if steps >= ends[run.number + 1]:
@@ -261,22 +258,12 @@ def summarise(infos: list[dict], buffer: RolloutBuffer, env: LocomotionEnv) -> d
 class Progress:
     """One CSV row an iteration, and the live line."""
 
-    def __init__(self, path: Path, iteration: int, steps: int, total: int):
-        """iteration: from which a run goes on; later rows of an earlier try are dropped."""
-        self.path, self.total, self.first, self.start = path, total, steps, time.monotonic()
-        self.rows = self._read(iteration) if iteration else []
-        if self.rows:
-            write_csv(path, self.rows)
-
-    def _read(self, iteration: int) -> list[dict]:
-        try:
-            with open(self.path, newline="") as file:
-                rows = [x for x in csv.DictReader(file) if int(x["iteration"]) <= iteration]
-            [float(number) for row in rows for number in row.values()]
-            return rows
-        except (OSError, KeyError, ValueError, TypeError):
-            print(f"warning: {self.path} was damaged and begins anew", file=sys.stderr)
-            return []
+    def __init__(self, path: Path, rows: list[dict], total: int):
+        """rows: of the iterations up to the checkpoint that a run goes on from."""
+        self.path, self.rows, self.total, self.start = path, rows, total, time.monotonic()
+        self.first = rows[-1]["steps"] if rows else 0
+        if rows:
+            write_csv(path, rows)  # later ones of an earlier try are dropped
 
     def curve(self) -> torch.Tensor:
         """(n, len(CURVE)), every tenth iteration."""

@@ -32,7 +32,8 @@ class WalkingRobots(VectorEnv):
     def reset(self, *, seed=None, options=None):
         if seed is not None:  # else the random numbers of `LocomotionEnv(seed=...)` go on
             super().reset(seed=seed)
-            self.env.rng = self.np_random
+            self.env.rng, self.env._luck = self.np_random, (seed,)
+            self.env.episode[:] = 0
         return self._told(self.env.reset()), {}
 
     def step(self, actions):

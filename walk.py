@@ -115,10 +115,13 @@ def walk_cases(
     for path, (policy, card) in policies.items():
         label = f"{card['policy']}, seed {card['seed']}, {', '.join(cases)}"[:60]
         walk = take_a_walk(policy, args.robot, faults, *how, label=label, **sim)
-        healthy = [i for i, fault in enumerate(faults) if fault == HEALTHY]
-        duties = dict(zip(walk.env.robot.legs, duty(walk, healthy)))
+        healthy, sound = [i for i, fault in enumerate(faults) if fault == HEALTHY], walk
+        if not healthy:  # it takes a walk of its own to know
+            healthy, sound = range(8), take_a_walk(policy, args.robot, [HEALTHY] * 8, *how, **sim)
+        duties = dict(zip(sound.env.robot.legs, duty(sound, healthy)))
         for i, (case, episode) in enumerate(labels):
-            used = [duties.get(harm.part[:2], 1.0) for harm in harms_of(faults[i]) if healthy]
+            parts = [harm.part.split("_")[0] for harm in harms_of(faults[i])]
+            used = [duties.get(leg, 1.0) for leg in parts]
             share, fell = min(1.0, walk.distance[i] / (speed * args.seconds)), walk.fell[i]
             rows.append(origin(path, card) | {
                 "case": case, "episode": episode, "fell": int(fell),

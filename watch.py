@@ -79,7 +79,8 @@ def film(args, policy, terrain: Terrain | None) -> None:
         renderer.update_scene(data, camera)
         frames.append(Image.fromarray(renderer.render()))
     # one palette for all frames keeps the file small and the colours still, a fault's red too
-    palette = frames[0].quantize(64, Image.Quantize.FASTOCTREE)
+    some = Image.fromarray(np.vstack([np.array(frame) for frame in frames[::10]]))
+    palette = some.quantize(64, Image.Quantize.FASTOCTREE)
     first, *rest = (frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames)
     pace = {"duration": round(2000 * CONTROL_DT), "loop": 0}  # ms a frame
     first.save(args.out, save_all=True, append_images=rest, optimize=True, **pace)

@@ -71,8 +71,8 @@ def test_a_verdict_takes_three_seeds_and_an_interval_off_zero():
     good, bad, mixed = ([np.array([x, x]) for x in xs] for xs in seeds)
     assert report.judge(good, bad)[1] == "shows" and report.judge(bad, good)[1] == "does not"
     assert report.judge(good[:2], bad)[1:] == ("undecided", "3")
-    assert report.judge(good, [np.array([0.8])])[1] == "shows"
-    words, verdict, needed = report.judge(mixed, [np.array([0.5])])
+    assert report.judge(good, 0.8)[1] == "shows"
+    words, verdict, needed = report.judge(mixed, 0.5)
     # the mean 2/3 is 1/6 above, the variance of the seeds 1/3: 1.96^2 / 3 * 36 = 46.1
     assert words.startswith("+0.17") and (verdict, needed) == ("undecided", "47")
 
@@ -96,4 +96,4 @@ def test_the_claims_leave_out_who_is_untrained_and_legs_that_hang(tmp_path, caps
 def test_noise_is_measured_by_what_is_kept():
     rows = table(rolt={"FR": [[0.8, 0.8]], "RR": [[0.4, 0.2]]})
     claim = report.Claim("", "low_frequency", "kept", ("mlp",))
-    assert report.measured(rows, "rolt", claim)[0] == pytest.approx([0.5, 0.25])
+    assert report.measured(rows, "rolt", claim, ["RR"])[0] == pytest.approx([0.5, 0.25])

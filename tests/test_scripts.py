@@ -42,7 +42,8 @@ def tensors(value, name=""):
 
 def same_run(one, other):
     """The same checkpoint to the bit, and the same rows but for the times."""
-    runs = [dict(tensors(checkpoint.load(run / "checkpoint.pt"))) for run in (one, other)]
+    whole = (checkpoint.load(run / "checkpoint.pt") for run in (one, other))
+    runs = [dict(tensors(run | {"rows": len(run["rows"])})) for run in whole]
     assert runs[0].keys() == runs[1].keys()
     for name, x in runs[0].items():
         y = runs[1][name]
@@ -195,6 +196,7 @@ def test_all_shipped_seeds_are_put_together(tmp_path, monkeypatch):
         (train, ["--envs", "7", "--threads", "2"], "do not divide"),
         (train, ["--epochs", "1", "--minibatches", "1"], "two steps"),
         (train, ["--resume", "--out", "nowhere"], "nothing to resume"),
+        (train, ["--out", ""], "is empty"),
         (train, [*SMALL, "--threads", "1", "--out", "/proc/here"], "/proc/here"),
         (train, [*SMALL, "--out", "new", "--threads", "1", "--init", "text.pt"], "not a whole"),
         (evaluate, ["stiffness", "--robot", "a2"], "invalid choice"),
@@ -258,11 +260,12 @@ def test_the_model_needs_torch_alone():
     assert set(imports) - sys.stdlib_module_names == {"torch"}
 
 
-def test_a_damaged_table_costs_the_table_alone(tmp_path, capsys):
+def test_a_finished_run_says_so_and_mends_its_table(tmp_path, capsys):
     words = ["--threads", "1", *SMALL, "--steps", "384", "--out", str(tmp_path)]
     train.main(words)
+    whole = (tmp_path / "progress.csv").read_text()
     (tmp_path / "progress.csv").write_text("iteration,steps\n1,x\n")
     train.main([*words, "--resume"])
-    told = capsys.readouterr()
-    assert "damaged and begins anew" in told.err and "it was finished already" in told.out
-    assert "nan" not in told.out and "no episode" not in told.out
+    told = capsys.readouterr().out
+    assert "it was finished already" in told and "nan" not in told
+    assert (tmp_path / "progress.csv").read_text() == whole

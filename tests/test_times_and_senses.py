@@ -147,8 +147,6 @@ def test_senses_change_what_is_seen_and_not_what_moves():
               "odometry:trunk:0.5")  # fmt: skip
     env, rng = make(*faults), np.random.default_rng(0)
     for step in range(20):
-        if step == 5:
-            held = env.joint_error[0, 0, 2], env.joint_velocity[0, 0, 2]
         observation, *_ = env.step(np.tile(rng.normal(size=(1, 12)), (6, 1)))
         if step == 5:
             held = env.joint_error[0, 0, 2], env.joint_velocity[0, 0, 2]  # the first one it missed
@@ -169,6 +167,27 @@ def test_senses_change_what_is_seen_and_not_what_moves():
     assert tilted[0, 18:21] == pytest.approx(told, abs=1e-4)
 
 
+def test_what_freezes_again_after_a_reset_holds_its_own_reading():
+    env, rng = LocomotionEnv("a1", 1, 0, 1, [(1.0, "freeze:FR_calf")]), np.random.default_rng(0)
+    readings = []
+    for _ in range(2):  # poses at the start vary
+        readings.append(env.reset().legs[0, 0, -1, 2])
+        assert readings[-1] == pytest.approx(4 * env.joint_error[0, 0, 2])
+        for _ in range(5):
+            assert flail(env, rng)[0].legs[0, 0, -1, 2] == readings[-1]
+    assert readings[0] != readings[1]
+
+
+def test_an_older_lock_stays_where_it_holds_when_another_fault_comes():
+    env, rng = make("lock:FR_calf@0.1:+weaken:RL:0.5@0.2:"), np.random.default_rng(0)
+    for _ in range(6):
+        flail(env, rng)
+    seat = env.fault_writer.values["eq_data"][0, 2, 0]
+    for _ in range(10):
+        flail(env, rng)
+    assert env.fault_now[0].count("+") == 1 and env.fault_writer.values["eq_data"][0, 2, 0] == seat
+
+
 def test_critics_are_told_while_it_lasts():
     env = make("payload:trunk:2@0.1:0.2", "bias:FL:0.2", extras=("privileged",))
     rng = np.random.default_rng(0)
@@ -184,13 +203,15 @@ def test_critics_are_told_while_it_lasts():
     ("late:FR:-0.01", "from 0 to 0.04"), ("late:FR:0.05", "from 0 to 0.04"),
     ("bias:FR:nan", "from -7 to 7"), ("bias:XX:0.1", "no joint or leg"),
     ("payload:roof:1", "no roof"), ("blow:trunk:inf", "from -100 to 100"),
+    ("blow:trunk:5", "when is the blow"), ("lock:FR_calf@5:inf", "cannot read"),
     ("lock:FR_calf@nan:", "cannot read"),
 ])  # fmt: skip
 def test_what_cannot_be_is_refused_at_once(text, says):
     with pytest.raises(ValueError, match=says):
         make(text)
-    with pytest.raises(ValueError, match=says):
-        make(text if "@" in text else text + "@5:")
+    if "@" not in text and says != "when is the blow":
+        with pytest.raises(ValueError, match=says):
+            make(text + "@5:")
 
 
 def test_words_are_whole():
