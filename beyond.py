@@ -111,7 +111,7 @@ def matrix(args, policies) -> None:
     maps = {}
     print("\n| method | share of the map that is survived |\n|---|---|")
     for method in dict.fromkeys(row["method"] for row in rows):
-        used = [row for row in rows if float(row["leg_duty"]) >= USED]
+        used = [row for row in rows if not float(row["leg_duty"]) < USED]  # NaN: not known
         mean, low, high = mean_and_interval(by_seed(used, "success", method=method))
         print(f"| {method} | {mean:.2f} ({low:.2f} to {high:.2f}) |")
         both = (scores(rows, method, [*cases], column).mean(axis=0) for column in ("share", "fell"))

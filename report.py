@@ -89,7 +89,8 @@ def trained(rows: list[dict], method: str) -> bool:
 
 def uses(rows: list[dict], method: str, case: str) -> bool:
     """Do all seeds of the method walk on the leg that this case harms?"""
-    return min(min(x) for x in by_seed(rows, "leg_duty", method=method, case=case)) >= USED
+    duties = by_seed(rows, "leg_duty", method=method, case=case)
+    return not any((x < USED).any() for x in duties)
 
 
 def scores(rows: list[dict], method: str, cases: list[str], column="share") -> np.ndarray:
