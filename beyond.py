@@ -43,6 +43,8 @@ def curves(args, policies) -> None:
     for _, card in policies.values():
         if len(card["curve"]):
             methods.setdefault(card["policy"], []).append(card["curve"].numpy())
+    if not methods:
+        raise ValueError("none of these files has a learning curve: they are of an older version")
     plots.learning_curves(methods, args.out / "curves.png", f"{args.robot}, {args.task}")
 
 
@@ -86,7 +88,8 @@ def recovery(walk: Walk, i: int) -> dict[str, str]:
         before = (x[strike] - x[second]) / (strike - second)  # m a step
         numbers["during"] = (x[end] - x[strike]) / (end - strike) / before
         speed = (x[end:] - x[end - second : -second]) / second  # the mean of the second before
-        if before > 0 and not walk.fell[i] and (back := np.flatnonzero(speed >= BACK * before)).size:
+        back = np.flatnonzero(speed >= BACK * before)
+        if before > 0 and len(back) and not walk.fell[i]:
             numbers["recovery_s"] = back[0] * CONTROL_DT
     return {name: f"{number:.3f}" for name, number in numbers.items()}
 
@@ -106,8 +109,9 @@ def matrix(args, policies) -> None:
             whole = [f"{x}_{last}" if args.pairs and ":{}:" not in word else x for x in names]
             cases[f"{'+'.join(names)}, {harm}"] = "+".join(word.format(name) for name in whole)
     rows = walk_cases(args, policies, cases, SPEED)
-    name = "matrix-pairs" if args.pairs else "matrix"
-    write_csv(args.out / f"{name}.csv", rows)
+    args.experiment += "-pairs" * args.pairs
+    path = args.out / args.experiment
+    write_csv(path.with_suffix(".csv"), rows)
     maps = {}
     print("\n| method | share of the map that is survived |\n|---|---|")
     for method in dict.fromkeys(row["method"] for row in rows):
@@ -118,7 +122,7 @@ def matrix(args, policies) -> None:
         maps[f"{method}: {mean:.0%} survived"] = [x.reshape(len(parts), -1) for x in both]
     labels = ["+".join(names) for names in parts], [*HARMS]
     title = f"Share of the distance, and falls: {robot.name}"
-    plots.heat_maps(maps, *labels, args.out / f"{name}.png", title)
+    plots.heat_maps(maps, *labels, path.with_suffix(".png"), title)
 
 
 def senses(args, policies) -> None:

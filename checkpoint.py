@@ -7,6 +7,7 @@ Two kinds, both of torch.save, both dictionaries of plain values and tensors:
 """
 
 import os
+import sys
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -88,6 +89,8 @@ def start_from(path: str | Path, policy: torch.nn.Module, critic: torch.nn.Modul
     """Puts the file's policy and critic into fresh ones. New inputs (the scan) come last, and their
     weights start at 0: nothing changes at first (a ROLT's new patch tokens do draw attention)."""
     with loaded(path) as content:
+        if not content["critic"]:
+            print(f"warning: {path} has no critic; a fresh one starts", file=sys.stderr)
         for module, saved in ((policy, content["weights"]), (critic, content["critic"])):
             own = module.state_dict()
             for name, x in saved.items():

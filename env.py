@@ -179,7 +179,7 @@ class LocomotionEnv:
         self.last_action, self.action = self.action, np.clip(action, -MAX_ACTION, MAX_ACTION)
         target = self._default + self.robot.action_scale * self._joint_sign * self.action  # rad
         self._ctrl[:] = target.reshape(self._ctrl.shape)
-        self._strike(np.flatnonzero(self.fault_writer.timed[self.fault_index]))
+        self.strike(np.flatnonzero(self.fault_writer.timed[self.fault_index]))
         self.world.step(nstep=SUBSTEPS, stage=mujoco.mjtStage.mjSTAGE_VEL)
         self.age += 1
         self.command_age += 1
@@ -240,7 +240,7 @@ class LocomotionEnv:
         for name in SAVED:
             getattr(self, name)[...] = state[name]
         self.rng.bit_generator.state = state["random"]
-        self._strike(range(self.num_envs), anew=True, ago=1)  # what was so in the last step
+        self.strike(range(self.num_envs), anew=True, ago=1)  # what was so in the last step
         self.fault_writer.senses.held[...] = state["held"]
         self.fault_writer.values["eq_data"][...] = state["eq_data"]
         self._friction[...] = state["friction"]
@@ -260,7 +260,7 @@ class LocomotionEnv:
         self._friction[np.ix_(ids, self._geoms, [0])] = friction
         self.episode[ids] += 1
         self.age[ids] = self.first_age[ids] = 0
-        self._strike(ids, anew=True)
+        self.strike(ids, anew=True)
         locked = self.world.bind("eq_active")[ids] > 0
         limits = self.world.expand("jnt_range")[ids][:, self._joints]
         pose = np.clip(pose.reshape(n, -1), limits[:, :, 0], limits[:, :, 1])
@@ -284,7 +284,7 @@ class LocomotionEnv:
         self._steer()
         self.history[ids] = self._frame()[ids, :, None]  # as though it had always stood like this
 
-    def _strike(self, ids, anew: bool = False, ago: int = 0) -> None:
+    def strike(self, ids, anew: bool = False, ago: int = 0) -> None:
         """Gives the robots `ids` what is wrong at this step; anew: even if it is what they have;
         ago 1, at a resume: what was so in the last step, so that what begins now strikes."""
         for i in ids:

@@ -18,26 +18,6 @@ def grid_of_axes(rows: int, columns: int, width: float, height: float, title: st
     return figure, figure.subplots(rows, columns, squeeze=False)
 
 
-def learning_curve(rows: list[dict], picture: Path) -> None:
-    """Draws the rows of a run's progress.csv over steps."""
-    column = {name: np.array([float(row[name]) for row in rows]) for name in rows[0]}
-    panels = {
-        "return of an episode": ["episode_return"],
-        "forward speed [m/s]": ["speed", "commanded_speed"],
-        "length of an episode [s]": ["episode_seconds"],
-        "std of the actions, KL of an update": ["std", "kl"],
-    }
-    figure, axes = grid_of_axes(2, 2, 4.5, 2.75, picture.parent.name)
-    for axis, (title, names) in zip(axes.flat, panels.items()):
-        for name in names:
-            axis.plot(column["steps"] / 1e6, column[name], lw=1.2, label=name.replace("_", " "))
-        axis.set(title=title, xlabel="env steps [million]")
-        axis.grid(alpha=0.3)
-        if len(names) > 1:
-            axis.legend(loc="upper left")
-    figure.savefig(picture)
-
-
 def learning_curves(methods: dict[str, list], picture: Path, title: str) -> None:
     """methods: {name: a (n, len(CURVE)) array a seed}. A line is the mean of the seeds, a band what
     lies between the lowest and the highest."""
@@ -52,8 +32,7 @@ def learning_curves(methods: dict[str, list], picture: Path, title: str) -> None
         for axis, values in zip(axes[0], (returns, speed / command, falls)):
             axis.plot(steps[:, 0] / 1e6, values.mean(axis=1), lw=1.2, label=method)
             axis.fill_between(steps[:, 0] / 1e6, values.min(axis=1), values.max(axis=1), alpha=0.2)
-    handles = axes[0, 0].get_legend_handles_labels()
-    figure.legend(*handles, loc="outside lower center", ncols=min(6, len(methods)))
+    figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=6)
     figure.savefig(picture)
 
 

@@ -30,7 +30,7 @@ import checkpoint
 from baselines import METHODS, Stage, make_policy, training_stages
 from env import CONTROL_DT, EnvConfig, LocomotionEnv
 from faults import TASKS, first_task
-from plots import learning_curve
+from plots import learning_curves
 from ppo import Critic, Learner, PPOConfig, RolloutBuffer, average, collect
 from robots import ROBOTS
 from walk import write_csv
@@ -59,7 +59,7 @@ def parse_arguments(argv: list[str] | None = None):
     add("--minibatches", type=count, default=PPOConfig.minibatches, help="an epoch")
     add("--paper", action="store_true", help="4096 robots, 400M steps, 5 epochs of 4 minibatches")
     add("--scan", action="store_true", help="the height scan on flat ground, too (as in the paper)")
-    add("--init", metavar="FILE", help="a policy.pt or checkpoint.pt to start from: flat, then stairs")
+    add("--init", metavar="FILE", help="a policy.pt to start from: flat, then stairs")
     add("--seed", type=int, default=0)
     add("--device", choices=devices, default=devices[-1], help="default: cuda if there is one")
     add("--precision", choices=("auto", "fp32", "bf16"), default="auto", help="auto: bf16 if fast")
@@ -195,7 +195,8 @@ def train(rank: int, args, sync: str) -> None:
             checkpoint.save_policy(content, args.out / "policy.pt")
             if snapshot:  # to see how a policy grew
                 checkpoint.save_policy(content, args.out / f"policy-{steps / 1e6:.1f}M.pt")
-            learning_curve(progress.rows, args.out / "progress.png")
+            curves = {args.policy: [content["curve"].numpy()]}
+            learning_curves(curves, args.out / "progress.png", args.out.name)
 
     if rank == 0:
         progress = Progress(args.out / "progress.csv", saved.get("rows", []), ends[-1])
@@ -266,9 +267,9 @@ class Progress:
             write_csv(path, rows)  # later ones of an earlier try are dropped
 
     def curve(self) -> torch.Tensor:
-        """(n, len(CURVE)), every tenth iteration."""
-        rows = [[float(row[name]) for name in checkpoint.CURVE] for row in self.rows[9::10]]
-        return torch.tensor(rows).reshape(-1, len(checkpoint.CURVE))
+        """(n, len(CURVE)), the first and every tenth iteration."""
+        rows = [[float(row[name]) for name in checkpoint.CURVE] for row in self.rows[::10]]
+        return torch.tensor(rows)
 
     def log(self, row: dict) -> None:
         """Adds to the row what the episodes of the last iterations were like, and writes it."""

@@ -20,7 +20,8 @@ class WalkingRobots(VectorEnv):
     metadata = {"autoreset_mode": AutoresetMode.SAME_STEP}
 
     def __init__(self, robot: str, num_envs: int, **options):
-        self.env, self.num_envs = LocomotionEnv(robot, num_envs, **options), num_envs
+        self.make = lambda **seed: LocomotionEnv(robot, num_envs, **options | seed)
+        self.env, self.num_envs = self.make(), num_envs
         fields = self._told(self.env.reset()).items()
         boxes = {name: gym.spaces.Box(-np.inf, np.inf, x.shape[1:]) for name, x in fields}
         self.single_observation_space = gym.spaces.Dict(boxes)
@@ -30,10 +31,9 @@ class WalkingRobots(VectorEnv):
         self.action_space = batch_space(self.single_action_space, num_envs)
 
     def reset(self, *, seed=None, options=None):
-        if seed is not None:  # else the random numbers of `LocomotionEnv(seed=...)` go on
-            super().reset(seed=seed)
-            self.env.rng, self.env._luck = self.np_random, (seed,)
-            self.env.episode[:] = 0
+        super().reset(seed=seed)
+        if seed is not None:  # else the random numbers go on
+            self.env = self.make(seed=seed)
         return self._told(self.env.reset()), {}
 
     def step(self, actions):

@@ -69,7 +69,7 @@ def film(args, policy, terrain: Terrain | None) -> None:
     camera.elevation = -18
     camera.azimuth = 60 if terrain else 125  # from behind, stairs show their steps
     for step in steps:
-        now = fault_now(args.fault, step, (args.seed, 0, 1))
+        now = fault_now(args.fault, step, (args.seed, 0, 1))  # robot 0, first episode: as in env
         if now not in colours:
             colours[now] = painted(walk.env, now).geom_rgba
         model.geom_rgba[:] = colours[now]
@@ -120,7 +120,7 @@ class Show:
         faulty_model(fault, self.env.robot, self.env.model)  # is it one?
         self.env.pin_faults([fault])  # at the next resets, too
         self.env.age[:] = self.env.first_age[:] = 0  # its times count from now on
-        self.env._strike([0])
+        self.env.strike([0])
         self.fault = fault
         self.repaint()
 
