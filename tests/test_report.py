@@ -97,3 +97,18 @@ def test_noise_is_measured_by_what_is_kept():
     rows = table(rolt={"FR": [[0.8, 0.8]], "RR": [[0.4, 0.2]]})
     claim = report.Claim("", "low_frequency", "kept", ("mlp",))
     assert report.measured(rows, "rolt", claim, ["RR"])[0] == pytest.approx([0.5, 0.25])
+
+
+def test_a_comparison_leaves_out_who_is_untrained_and_gives_no_p_to_few_seeds(capsys):
+    walks, slow = [[0.9, 0.9]] * 3, [[0.5, 0.5]] * 3
+    rows = table(rolt={"FR": walks, "RR": walks, "RL": walks},
+                 mlp={"FR": walks, "RR": slow, "RL": slow},
+                 rma={"FR": slow, "RR": walks, "RL": walks})  # fmt: skip
+    report.compare(rows, {"unseen": ["RR", "RL"]})
+    head, _, rolt, mlp = capsys.readouterr().out.strip().splitlines()
+    assert head.startswith("| unseen (RR) |")  # of RL the MLP's leg hangs
+    assert rolt == "| rolt | 0.90 | | |" and mlp == "| mlp | 0.50 | 100% | - |"
+    five = [x * 2 for x in ([[0.9]] * 3, [[0.5]] * 3)]
+    rows = table(rolt={"FR": five[0], "RR": five[0]}, roam={"FR": five[0], "RR": five[1]})
+    report.compare(rows, {"unseen": ["RR"]})
+    assert capsys.readouterr().out.strip().endswith("| roam | 0.50 | 100% | 0.002 |")  # 2 of 924
