@@ -1,8 +1,8 @@
 """Policies and runs as files: saved whole or not at all, and read without running what is inside.
 
 Two kinds, both of torch.save, both dictionaries of plain values and tensors:
-    policy.pt      `CARD`, policy and critic, matrices in half precision, and the learning curve (n,
-                   len(CURVE)): 2 MB, to show, to give away, and to start from (`--init`)
+    policy.pt      `CARD` (curve: (n, len(CURVE)), how it learned), policy and critic, matrices in
+                   half precision: 2 MB, to show, to give away, and to start from (`--init`)
     checkpoint.pt  the same in full, and all else that `train.py --resume` needs to go on
 """
 
@@ -18,7 +18,7 @@ from faults import TASKS
 from robots import ROBOTS
 
 FORMAT = 2  # 1 was before leg frames
-CARD = ("robot", "task", "policy", "scan", "seed", "steps", "stages", "init")  # what it is for
+CARD = ("robot", "task", "policy", "scan", "seed", "steps", "stages", "init", "curve")  # about it
 CURVE = ("steps", "episode_return", "speed", "commanded_speed", "fall_share")  # how it learned
 
 
@@ -42,7 +42,7 @@ def save(content: dict, path: Path) -> None:
 
 def save_policy(content: dict, path: Path) -> None:
     """The part of a checkpoint.pt that a policy.pt is."""
-    part = {key: content[key] for key in (*CARD, "curve")}
+    part = {key: content[key] for key in CARD}
     for module in ("weights", "critic"):
         x = content[module]
         part[module] = {name: w.half() if w.dim() > 1 else w for name, w in x.items()}
@@ -76,7 +76,7 @@ def loaded(path: str | Path):
 def load_policy(path: str | Path, robot: str | None = None) -> tuple[torch.nn.Module, dict]:
     """The policy in the file (of this robot, if one is given), ready to act, and its card."""
     with loaded(path) as content:
-        card = {key: content[key] for key in (*CARD, "curve")}
+        card = {key: content[key] for key in CARD}
         name, task, scan = card["policy"], TASKS[card["task"]], card["scan"]
         policy = make_policy(name, ROBOTS[card["robot"]], task, scan)
         policy.load_state_dict(content["weights"])  # as float32, whatever the file has

@@ -158,17 +158,18 @@ def gaits(args, policies) -> None:
     for path, (policy, card) in policies.items():
         walk = take_a_walk(policy, args.robot, faults, 0.75, args.seconds, args.seed, args.threads)
         legs = walk.env.robot.legs
-        print(f"\n{card['policy']:24}", *(f"{leg:>5}" for leg in legs), " of the time down")
+        name = f"{card['policy']} {card['seed']}"
+        print(f"\n{name:24}", *(f"{leg:>5}" for leg in legs), " of the time down")
         for first, case in zip(range(0, len(faults), n), cases):
             shares = duty(walk, range(first, first + n))
             print(f"{case:24}", *(f"{share:5.2f}" for share in shares))
             row = origin(path, card) | {"case": case}
             rows += [row | {"leg": leg, "duty": f"{x:.3f}"} for leg, x in zip(legs, shares)]
             shown = walk.contacts[: walk.steps[first], first][-round(1 / CONTROL_DT) :]
-            panels.append((f"{card['policy']}, {case}", shown))
+            panels.append((f"{name}, {case}", shown))
     write_csv(args.out / "gaits.csv", rows)
-    picture, name = args.out / "gaits.png", f"Gaits: {args.robot}, feet on the ground, 1 s"
-    plots.gait_diagrams(panels, legs, CONTROL_DT, len(policies), picture, name)
+    title = f"Gaits: {args.robot}, feet on the ground, 1 s"
+    plots.gait_diagrams(panels, legs, CONTROL_DT, len(policies), args.out / "gaits.png", title)
 
 
 def mechanisms(args, policies) -> None:
