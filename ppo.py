@@ -15,6 +15,7 @@ from dataclasses import dataclass
 
 import torch
 import torch.distributed as dist
+import torch.distributed.nn  # else torch.optim does, later, and it keeps the group alive
 from torch import Tensor, nn
 from torch.distributions import Normal, kl_divergence
 
