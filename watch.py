@@ -55,13 +55,13 @@ def film(args, policy, terrain: Terrain | None) -> None:
         raise RuntimeError(f"with {args.fault} the robot falls within 2 s: nothing to show")
     model, colours = painted(walk.env, "healthy"), {}
     try:
-        if NO_DISPLAY and "MUJOCO_GL" not in os.environ:  # MuJoCo would look for a window
+        if sys.platform == "linux" and "MUJOCO_GL" not in os.environ:  # without asking a display
             from mujoco import egl
 
             mujoco.rendering.classic.gl_context.GLContext = egl.GLContext
         renderer = mujoco.Renderer(model, height=300, width=480)
     except Exception as error:  # each backend fails in its own way
-        way_out = "try MUJOCO_GL=egl (libegl1) or osmesa (libosmesa6)"
+        way_out = "install libegl1, or try MUJOCO_GL=glfw (a display) or osmesa (libosmesa6)"
         raise RuntimeError(f"cannot draw ({error}): {way_out}") from error
 
     data, camera, frames = mujoco.MjData(model), mujoco.MjvCamera(), []

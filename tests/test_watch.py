@@ -65,9 +65,9 @@ def test_a_word_that_cannot_be_read_changes_nothing(show, word, why):
 
 
 def test_films_are_written_without_a_display(tmp_path, monkeypatch):
-    """Where no off-screen rendering works, the script must say so in one line."""
-    for name in ("DISPLAY", "WAYLAND_DISPLAY", "MUJOCO_GL"):
-        monkeypatch.delenv(name, raising=False)
+    """Or with one that is gone. Where nothing can be drawn, the script must say so in one line."""
+    monkeypatch.delenv("MUJOCO_GL", raising=False)
+    monkeypatch.setenv("DISPLAY", ":99")
     words = [sys.executable, ROOT / "watch.py", "--fault", "lock:FL_calf", "--seconds", "0.4"]
     words += ["--checkpoint", save_policy(tmp_path / "policy.pt"), "--out", "one.gif"]
     one = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True)
