@@ -3,6 +3,7 @@
     python evaluate.py sudden             # a fault that strikes in mid-stride, and goes
     python evaluate.py matrix [--pairs]   # every joint, five ways
     python evaluate.py senses             # sensors that fail, motors that are late
+    python evaluate.py legs --checkpoints FILE ...    # how many legs must training harm?
     python evaluate.py growth --checkpoints runs/*/policy-*M.pt
     python evaluate.py curves             # learning curves
 
@@ -24,7 +25,8 @@ from walk import Walk, read_csv, walk_cases, write_csv
 SPEED = 0.75  # m/s, the paper's
 STRIKE, END, LENGTH = 5.0, 12.0, 20.0  # s
 BACK = 0.8  # of the speed before
-HARMS = {"lock": "lock:{}", "disable": "disable:{}"}
+DEAD = "lock", "disable"  # what makes a joint of no use
+HARMS = {harm: f"{harm}:{{}}" for harm in DEAD}
 HARMS |= {f"weaken to {x}": f"weaken:{{}}:{x}" for x in (0.75, 0.5, 0.25)}
 KEY = ("checkpoint", "case", "episode")  # of a row
 # What is late or sensed wrongly, five severities each. The last two: of how many quarters of legs.
@@ -63,6 +65,26 @@ def growth(args, policies) -> None:
     rows.sort(key=lambda row: float(row["case"]))
     columns = {"success": "success on unseen faults", "share": "share of the distance"}
     report(args, rows, columns, f"Growth: {args.robot}", x="env steps [million]")
+
+
+def legs(args, policies) -> None:
+    """How many legs must training harm, and does it help if locks come and go? Policies of several
+    tasks, with each calf locked, and each dead, which none of them has seen."""
+    calves = [joint for joint in ROBOTS[args.robot].joints if "calf" in joint]
+    cases = {HEALTHY: HEALTHY}
+    cases |= {f"{joint[:2]} {harm}": f"{harm}:{joint}" for harm in DEAD for joint in calves}
+    rows = walk_cases(args, policies, cases, SPEED)
+    columns = {"success": "success", "distance_m": "distance walked [m]"}
+    report(args, rows, columns, f"Legs harmed in training: {args.robot}", seen=[HEALTHY])
+    print("\n| success | locked calves that it never saw | dead calves |\n|---|---|---|")
+    for path, (_, card) in policies.items():
+        seen, line = str(TASKS[card["task"]].seen), f"| {card['policy']}, seed {card['seed']} |"
+        for harm in DEAD:
+            new = [case for case in cases if harm in case and cases[case] not in seen]
+            some = [row for row in rows if row["checkpoint"] == str(path) and row["case"] in new]
+            mean, low, high = mean_and_interval(by_seed(some, "success")) if some else (np.nan,) * 3
+            line += f" {mean:.2f} ({low:.2f} to {high:.2f}) |"
+        print(line)
 
 
 def sudden(args, policies) -> None:

@@ -271,6 +271,7 @@ EXPERIMENTS = {
     "gaits": (gaits, None, "a1", METHODS),
     "curves": (beyond.curves, None, "a1", METHODS),
     "growth": (beyond.growth, None, "a1", METHODS),
+    "legs": (beyond.legs, "stiffness", "a1", METHODS),
     "sudden": (beyond.sudden, None, "a1", METHODS),
     "matrix": (beyond.matrix, None, "a1", METHODS),
     "senses": (beyond.senses, None, "a1", METHODS),
@@ -290,6 +291,9 @@ def find_policies(args, methods) -> dict[Path, tuple]:
     if not paths:
         sys.exit(f"error: no such checkpoints/{stem}-METHOD.pt: train one or name --checkpoints")
     found = {Path(os.path.relpath(path)): load_policy(path, args.robot) for path in paths}
+    if len({card["task"] for _, card in found.values()}) > 1:
+        for _, card in found.values():
+            card["policy"] += f" {card['task']}"
     names = [(card["policy"], card["seed"]) for _, card in found.values()]
     if len(set(names)) < len(names):  # how a policy grew: told apart by their steps
         for _, card in found.values():

@@ -284,12 +284,10 @@ class Task:
         return [fault for _, fault in self.training]
 
 
+STIFF = tuple(f"lock:{leg}_calf" for leg in ("FR", "FL", "RR", "RL"))
 TASKS = {
     # Section IV-A (i): "the other legs limp in the test". Halves ours. Also for the real-world Go1.
-    "stiffness": Task(
-        robots=("a1", "go1"), training=((0.5, HEALTHY), (0.5, "lock:FR_calf")),
-        unseen=tuple(f"lock:{leg}_calf" for leg in ("FL", "RR", "RL")),
-    ),
+    "stiffness": Task(("a1", "go1"), ((0.5, HEALTHY), (0.5, STIFF[0])), unseen=STIFF[1:]),
     # Section IV-A (ii): FRT, MRT, MLC one at a time, and the paper's nine in the test. Shares ours.
     "damage": Task(
         robots=("hexapod",),
@@ -300,6 +298,12 @@ TASKS = {
     ),
     # Section IV-B: "multiple terrains, including stairs, slopes and platforms"; tested with noise.
     "terrain": Task(robots=("a1",), training=((1.0, HEALTHY),), unseen=(), terrain=TRAINING_MAP),
+    # Ours (`evaluate.py legs`): the stiffness task with other faults to learn from. The last comes
+    # and goes, for 2 s of every 4.
+    "no-legs": Task(("a1",), ((1.0, HEALTHY),), STIFF),
+    "two-legs": Task(("a1",), ((0.5, HEALTHY), (0.25, STIFF[0]), (0.25, STIFF[2])), STIFF[1::2]),
+    "four-legs": Task(("a1",), ((0.5, HEALTHY), *((0.125, fault) for fault in STIFF)), ()),
+    "mid-stride": Task(("a1",), ((0.5, HEALTHY), (0.5, f"{STIFF[0]}@2/4")), STIFF[1:]),
 }  # fmt: skip
 
 

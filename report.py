@@ -172,6 +172,8 @@ CLAIMS = (
     Claim("... better than without shared legs", "stiffness", "success", UNSHARED, ("RR", "RL")),
     Claim("... or with a position for each leg", "stiffness", "success", ("module-pe",),
           ("RR", "RL")),
+    Claim("... or with no sign of which leg is which, FL too (ours)", "stiffness", "success",
+          ("no-identity",)),
     Claim("stays up with motors it never saw dead", "damage", "upright", (0.95,)),
     Claim("... and gets on", "damage", "success", (0.8, "module-pe", *UNSHARED)),
     Claim("displaced patches cost it the least", "low_frequency", "kept", NOISE),

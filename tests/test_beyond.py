@@ -52,5 +52,10 @@ def test_experiments_of_ours(tmp_path):
     assert len(cells) == 12 * 5 and cells[-1]["case"] == "RL_calf, weaken to 0.25"
     pairs = run("matrix", *one, "--pairs")
     assert len(pairs) == 6 * 5 and pairs[0]["case"] == "FR+FL, lock"
+    two = save_policy(tmp_path / "two.pt", task="two-legs")
+    taught = run("legs", "--checkpoints", files[0], two)
+    assert {row["method"] for row in taught} == {"rolt stiffness", "rolt two-legs"}
+    cases = ["healthy", "FR lock", "FL lock", "RR lock", "RL lock", "FR disable"]
+    assert [row["case"] for row in taught[:6]] == cases and len(taught) == 2 * 9
     failing = run("senses", *one)
     assert [row["case"] for row in failing] == list("01234") and "freeze" in failing[0]
