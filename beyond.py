@@ -88,11 +88,11 @@ def legs(args, policies) -> None:
 
 
 def sudden(args, policies) -> None:
-    """A healthy walk; at 5 s an unseen fault strikes, at 12 s it has gone. How long until the robot
-    goes at 80 % of its former speed again (mean over a second; 8 s: not within the test)? Always
-    20 s, whatever --seconds says."""
+    """A healthy walk; at 5 s a fault strikes, at 12 s it has gone. Training may have shown it, but
+    from the start on. How long until the robot goes at 80 % of its former speed again (mean over a
+    second; 8 s: not within the test)? Always 20 s, whatever --seconds says."""
     args.seconds = LENGTH
-    faults = TASKS[args.task].unseen
+    faults = *TASKS[args.task].seen[1:], *TASKS[args.task].unseen
     cases = {HEALTHY: HEALTHY} | {fault: f"{fault}@{STRIKE:g}:{END:g}" for fault in faults}
     rows = walk_cases(args, policies, cases, SPEED, recovery)
     columns = {"fell": "share of falls", "during": "speed while it lasts / before"}
