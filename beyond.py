@@ -69,22 +69,11 @@ def growth(args, policies) -> None:
 
 def legs(args, policies) -> None:
     """How many legs must training harm, and does it help if locks come and go? Policies of several
-    tasks, with each calf locked, and each dead, which none of them has seen."""
-    calves = [joint for joint in ROBOTS[args.robot].joints if "calf" in joint]
-    cases = {HEALTHY: HEALTHY}
-    cases |= {f"{joint[:2]} {harm}": f"{harm}:{joint}" for harm in DEAD for joint in calves}
-    rows = walk_cases(args, policies, cases, SPEED)
+    tasks (faults.py), with each calf locked, and each dead, which none of them has seen."""
+    faults = [f"{harm}:{leg}_calf" for harm in DEAD for leg in ROBOTS[args.robot].legs]
+    rows = walk_cases(args, policies, {fault: fault for fault in (HEALTHY, *faults)}, SPEED)
     columns = {"success": "success", "distance_m": "distance walked [m]"}
     report(args, rows, columns, f"Legs harmed in training: {args.robot}", seen=[HEALTHY])
-    print("\n| success | locked calves that it never saw | dead calves |\n|---|---|---|")
-    for path, (_, card) in policies.items():
-        seen, line = str(TASKS[card["task"]].seen), f"| {card['policy']}, seed {card['seed']} |"
-        for harm in DEAD:
-            new = [case for case in cases if harm in case and cases[case] not in seen]
-            some = [row for row in rows if row["checkpoint"] == str(path) and row["case"] in new]
-            mean, low, high = mean_and_interval(by_seed(some, "success")) if some else (np.nan,) * 3
-            line += f" {mean:.2f} ({low:.2f} to {high:.2f}) |"
-        print(line)
 
 
 def sudden(args, policies) -> None:

@@ -291,15 +291,15 @@ def find_policies(args, methods) -> dict[Path, tuple]:
     if not paths:
         sys.exit(f"error: no such checkpoints/{stem}-METHOD.pt: train one or name --checkpoints")
     found = {Path(os.path.relpath(path)): load_policy(path, args.robot) for path in paths}
-    if len({card["task"] for _, card in found.values()}) > 1:
-        for _, card in found.values():
+    cards = [card for _, card in found.values()]
+    several_tasks = len({card["task"] for card in cards}) > 1
+    grown = len({(card["policy"], card["task"], card["seed"]) for card in cards}) < len(cards)
+    for card in cards:
+        if several_tasks:
             card["policy"] += f" {card['task']}"
-    names = [(card["policy"], card["seed"]) for _, card in found.values()]
-    if len(set(names)) < len(names):  # how a policy grew: told apart by their steps
-        for _, card in found.values():
+        if grown:  # snapshots of a training
             card["policy"] += f" {card['steps'] / 1e6:.1f}M"
-    names = [(card["policy"], card["seed"]) for _, card in found.values()]
-    if len(set(names)) < len(names):
+    if len({(card["policy"], card["seed"]) for card in cards}) < len(cards):
         sys.exit("error: two of the checkpoints are of the same method, seed and steps")
     return found
 

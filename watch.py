@@ -33,7 +33,6 @@ from terrain import Terrain
 from walk import straight_ahead, take_a_walk
 
 HELP = "type a fault (lock:RL_calf, healthy), a speed (0.5), noise (sigma:0.1), again or quit"
-NO_DISPLAY = sys.platform == "linux" and not (os.getenv("DISPLAY") or os.getenv("WAYLAND_DISPLAY"))
 
 
 def painted(env: LocomotionEnv, fault: str) -> mujoco.MjModel:
@@ -240,7 +239,8 @@ def main(argv: list[str] | None = None) -> None:
     args = parser.parse_args(argv)
     if args.out and args.out.suffix != ".gif":
         parser.error(f"--out is a .gif file, not {args.out}")
-    if NO_DISPLAY and not args.out and not args.public:
+    display = sys.platform != "linux" or os.getenv("DISPLAY") or os.getenv("WAYLAND_DISPLAY")
+    if not (display or args.out or args.public):
         page = "--public a page that all can open who reach this machine"
         parser.error(f"there is no display: --out walk.gif writes a film, {page}")
     torch.set_num_threads(1)
