@@ -49,7 +49,7 @@ class Policy(nn.Module):
     def __init__(self, robot: Robot, scan: bool):
         super().__init__()
         self.num_actions = len(robot.joints)
-        self.frame = 3 * self.num_actions + 12  # numbers that the whole robot sees in one step
+        self.inputs = 3 * self.num_actions + 12  # numbers that the whole robot sees in one step
         self.extras = ("heights",) if scan else ()
         self.num_heights = SCAN_SHAPE[0] * SCAN_SHAPE[1] if scan else 0
         self.log_std = nn.Parameter(torch.full((self.num_actions,), ROLTConfig.initial_std).log())
@@ -70,7 +70,7 @@ class MLP(Policy):
 
     def __init__(self, robot: Robot, task: Task, scan: bool):
         super().__init__(robot, scan)
-        sizes = (HISTORY * self.frame + self.num_heights, *HIDDEN)
+        sizes = (HISTORY * self.inputs + self.num_heights, *HIDDEN)
         self.hidden = nn.ModuleList(nn.Linear(a, b) for a, b in zip(sizes, sizes[1:]))
         self.decoder = Decoder(sizes[-1], self.num_actions)
 
@@ -85,7 +85,8 @@ class MLP(Policy):
 
 class MirroredMLP(MLP):
     """Our control: symmetry, but no legs that share. In leg frames (NOTES 1) a state's mirror image
-    is the same numbers, left and right legs exchanged and the scan's columns reversed."""
+    is the same numbers, left and right legs exchanged and the scan's columns reversed (and those of
+    the noise on it, all that this policy draws)."""
 
     def __init__(self, robot: Robot, task: Task, scan: bool):
         super().__init__(robot, task, scan)
@@ -134,9 +135,9 @@ class RMA(Policy):
             )  # fmt: skip
         privileged = 2 * self.num_actions + 1 + len(other_harms(task.seen))
         self.encoder = network(privileged, 256, 128, LATENT)  # 256, 128: Kumar et al.
-        hidden = network(HISTORY * self.frame + features + LATENT, *HIDDEN)
+        hidden = network(HISTORY * self.inputs + features + LATENT, *HIDDEN)
         self.base = nn.Sequential(hidden, nn.ELU(), Decoder(HIDDEN[-1], self.num_actions))
-        self.adaptation = Adaptation(self.frame)
+        self.adaptation = Adaptation(self.inputs)
 
     def forward(self, observation: Observation, masks: Masks | None = None) -> Tensor:
         guessed = observation.past.numel() > 0
@@ -149,8 +150,9 @@ class RMA(Policy):
 
     def stages(self, task: Task) -> list[Stage]:
         base = [self.log_std] + [x for x in self.children() if x is not self.adaptation]
+        heights = tuple(name for name in self.extras if name != "past")
         return [
-            Stage("base", 1.0, task.training, self, base, extras=self.extras[:-1]),  # no past
+            Stage("base", 1.0, task.training, self, base, extras=heights),
             Stage("adaptation", LAST_STAGE, task.training, self, [self.adaptation],
                   extras=self.extras, learner=AdaptationLearner),
         ]  # fmt: skip
@@ -159,9 +161,9 @@ class RMA(Policy):
 class Adaptation(nn.Module):
     """z from 50 steps: each to 32 numbers, then convolutions over time (sizes of Kumar et al.)."""
 
-    def __init__(self, frame: int):
+    def __init__(self, inputs: int):
         super().__init__()
-        self.step = nn.Sequential(nn.Linear(frame, 32), nn.ELU())
+        self.step = nn.Sequential(nn.Linear(inputs, 32), nn.ELU())
         self.time = nn.Sequential(  # 50 -> 11 -> 7 -> 3 steps
             nn.Conv1d(32, 32, 8, stride=4), nn.ELU(), nn.Conv1d(32, 32, 5), nn.ELU(),
             nn.Conv1d(32, 32, 5), nn.ELU(), nn.Flatten(), nn.Linear(3 * 32, LATENT),
@@ -195,7 +197,7 @@ class ROAM(Policy):
     def __init__(self, robot: Robot, task: Task, scan: bool):
         super().__init__(robot, scan)
         self.behaviours = nn.ModuleList(MLP(robot, task, scan) for _ in task.training)
-        sizes = (HISTORY * self.frame + self.num_heights, *HIDDEN, 1)
+        sizes = (HISTORY * self.inputs + self.num_heights, *HIDDEN, 1)
         self.critics = nn.ModuleList(network(*sizes) for _ in task.training)
         self.generator = torch.Generator().manual_seed(0)  # of the choice at test
         del self.log_std  # each behaviour has its own

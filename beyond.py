@@ -1,30 +1,38 @@
-"""What the paper does not ask: how a policy grew, and what else it survives. Run by evaluate.py.
+"""What the paper does not ask. Run by evaluate.py, whose options count here, too.
 
+    python evaluate.py mechanisms         # is alive what the claims rest on?
+    python evaluate.py dropout_ratio      # why dropout has to be consistent
+    python evaluate.py curves             # learning curves
+    python evaluate.py growth --checkpoints runs/*/policy-*M.pt    # and what they knew on the way
+    python evaluate.py legs --checkpoints FILE ...    # how many legs must training harm?
     python evaluate.py sudden             # a fault that strikes in mid-stride, and goes
     python evaluate.py matrix [--pairs]   # every joint, five ways
     python evaluate.py senses             # sensors that fail, motors that are late
-    python evaluate.py legs --checkpoints FILE ...    # how many legs must training harm?
-    python evaluate.py growth --checkpoints runs/*/policy-*M.pt
-    python evaluate.py curves             # learning curves
 
-All on flat ground, told to walk at 0.75 m/s. Policies were trained on none of it, but for the
-faults of their task.
+All on flat ground (mechanisms of stairs' policies: stairs), told to walk at 0.75 m/s.
 """
 
+import sys
+from dataclasses import replace
 from itertools import combinations
 
 import numpy as np
+import torch
 
 import plots
-from env import CONTROL_DT
+from env import CONTROL_DT, LocomotionEnv
 from faults import HEALTHY, TASKS
+from ppo import Critic, PPOConfig, RolloutBuffer, collect
 from report import USED, by_seed, mean_and_interval, report, scores
 from robots import ROBOTS
-from walk import Walk, read_csv, walk_cases, write_csv
+from rolt import ROLT, Observation
+from terrain import Terrain
+from walk import Walk, duty, origin, read_csv, take_a_walk, walk_cases, write_csv
 
 SPEED = 0.75  # m/s, the paper's
 STRIKE, END, LENGTH = 5.0, 12.0, 20.0  # s
 BACK = 0.8  # of the speed before
+GATE = 0.1  # standard deviations of an action, ours: less is no mechanism
 DEAD = "lock", "disable"  # what makes a joint of no use
 HARMS = {harm: f"{harm}:{{}}" for harm in DEAD}
 HARMS |= {f"weaken to {x}": f"weaken:{{}}:{x}" for x in (0.75, 0.5, 0.25)}
@@ -37,6 +45,94 @@ SEVERITIES = {
     "odometry": (1, 0.75, 0.5, 0.25, 0),  # share of the velocity that is sensed
     "freeze": (0, 1, 2, 3, 4), "mute": (0, 1, 2, 3, 4),
 }  # fmt: skip
+
+
+def mechanisms(args, policies) -> None:
+    """Is what the claims rest on alive? How much a method's actions change in a healthy walk, in
+    their standard deviations, when a part of it is disturbed: an ablation is worth comparing if it
+    takes away 0.1 or more. Then how well a linear probe names a leg from its history (by chance 1
+    in L), and each foot's share of the time down: a fault on a leg below 0.1 tests nothing."""
+    rows = []
+    for path, (policy, card) in policies.items():
+        course = Terrain(("stairs",), (-1,) * 3) if card["task"] == "terrain" else None
+        how = {"seconds": 6.0, "seed": args.seed, "threads": args.threads, "terrain": course}
+        speed, seen = 0.5 if course else SPEED, []
+        walk = take_a_walk(policy, args.robot, [HEALTHY] * 32, speed, observations=seen, **how)
+        up = ~walk.fell | walk.fell.all()  # all, if none stays up
+        fields = zip(*(seen[100::10] or seen))  # every tenth step from 2 s on
+        states = Observation(*(torch.tensor(np.array(x)[:, up]).flatten(0, 1) for x in fields))
+        shares = zip(walk.env.robot.legs, duty(walk, range(32)))
+        numbers = {f"duty of {leg}": share for leg, share in shares}
+        actions = policy(states)
+        for name, other in disturbances(policy, states):
+            change = (policy(other) - actions) / actions.std(0)
+            numbers[name] = change.square().mean().sqrt().item()
+        numbers["leg named by its history"] = leg_probe(states.legs)
+        row = origin(path, card)
+        rows += [row | {"case": name, "value": f"{x:.4f}"} for name, x in numbers.items()]
+    columns = {"value": "change of the actions [their deviation]; share"}
+    report(args, rows, columns, f"Mechanisms: {args.robot}")
+    dead = [f"{row['method']}, {row['case']}" for row in rows if float(row["value"]) < GATE]
+    print(f"\nbelow the gate of {GATE}:", "; ".join(dead) or "nothing")
+
+
+def disturbances(policy, states: Observation):
+    """(what, the observation or the policy so disturbed), of those that the policy has."""
+    other = torch.arange(len(states.legs)).roll(len(states.legs) // 2)  # another robot's
+    if states.heights.numel():
+        yield "scan turned round", states._replace(heights=states.heights.flip(1))
+        yield "another's scan", states._replace(heights=states.heights[other])
+    yield "another's action token", states._replace(action=states.action[other])
+    yield "another's legs", states._replace(legs=states.legs[other])
+    for part in ("patch", "leg"):
+        if (position := getattr(policy, f"{part}_position", None)) is not None:
+            kept = position.clone()
+            position.copy_(position.mean(0).expand_as(position))
+            yield f"{part} positions equal", states
+            position.copy_(kept)
+
+
+def leg_probe(legs: torch.Tensor) -> float:
+    """Share of (B, L, H, frame) histories whose leg a linear fit to their first half can name."""
+    B, L = legs.shape[:2]
+    x = torch.cat([legs.flatten(2), torch.ones(B, L, 1)], dim=2).double()
+    a, b = x[: B // 2].flatten(0, 1), torch.eye(L).double().repeat(B // 2, 1)
+    weights = torch.linalg.solve(a.T @ a + 1e-2 * len(a) * torch.eye(a.shape[1]).double(), a.T @ b)
+    named = (x[B // 2 :] @ weights).argmax(2)
+    return (named == torch.arange(L)).double().mean().item()
+
+
+def dropout_ratio(args, policies) -> None:
+    """Not in the paper, but its case for consistency (section III-C) in one picture: PPO's ratio
+    before any weight has moved, where it should be 1. The first policy collects a rollout at every
+    rate; the update has its masks (consistent dropout), fresh (ordinary) or none (Roll-Drop)."""
+    (policy, card), *_ = policies.values()
+    if not isinstance(policy, ROLT):
+        sys.exit(f"error: {card['policy']} is no ROLT and has no feature dropout")
+    rows, faults, extras = [], TASKS["stiffness"].training, (*policy.extras, "privileged")
+    for rate in (1e-4, 1e-3, 1e-2, 0.05, 0.1, 0.2):
+        config = replace(policy.config, feature_dropout=rate)
+        model = ROLT(policy.num_legs, policy.num_joints, config)
+        model.load_state_dict(policy.state_dict())
+        env = LocomotionEnv(args.robot, 64, args.seed, 1, faults, extras=extras)
+        observation = env.reset(random_ages=True)
+        generator = torch.Generator().manual_seed(args.seed)
+        critic, masks = Critic(observation), model.sample_masks(64, generator)
+        buffer = RolloutBuffer(PPOConfig.steps, observation, env.num_actions, masks, "cpu")
+        for _ in range(2):  # what counts is the second, after half a second of walking
+            observation, _ = collect(env, model, critic, buffer, observation, generator)
+        batch = buffer.minibatch(torch.arange(len(buffer)))
+        fresh = model.sample_masks(len(buffer), generator)
+        schemes = {"stored masks": batch["masks"], "fresh masks": fresh, "no masks": None}
+        for scheme, masks in schemes.items():
+            actions = torch.distributions.Normal(model(batch["observation"], masks), buffer.std)
+            ratio = (actions.log_prob(batch["action"]).sum(-1) - batch["log_prob"]).exp()
+            clipped = ((ratio - 1).abs() > PPOConfig.clip).float().mean().item()
+            off = ratio.log().abs().median().exp().item()
+            row = {"method": scheme, "seed": card["seed"], "case": f"{rate:g}"}
+            rows.append(row | {"clipped": f"{clipped:.4f}", "off_by": f"{off:.4f}"})
+    columns = {"off_by": "factor by which the ratio is off (median)", "clipped": "share clipped"}
+    report(args, rows, columns, "PPO's ratio before any weight has moved", x="feature dropout rate")
 
 
 def curves(args, policies) -> None:

@@ -23,7 +23,7 @@ CURVE = ("steps", "episode_return", "speed", "commanded_speed", "fall_share")  #
 
 
 class CheckpointError(ValueError):
-    """What is read here is missing, damaged or of something else; says what would help."""
+    """A file is missing, damaged or of something else. The message says what would help."""
 
 
 def save(content: dict, path: Path) -> None:

@@ -22,8 +22,8 @@ Right legs see the trunk's own numbers. What only some read is empty, (N, 0), un
     past       (N, L, 50, 21)   as `legs`, 50 steps long                                    as above
     situation  (N, 1)           index of the robot's fault among the env's `faults`         1
 
-What rewards and users may read after a step (attributes; copy what you keep; of a robot whose
-episode has ended, all but contacts, which are the old one's, are already the next episode's):
+What rewards and users may read after a step (attributes). Copy what you keep. Where an episode has
+just ended, these are already of the next one; only the contacts are still the old one's.
     command, linear_velocity, angular_velocity, gravity (N, 3)  as above, unscaled
     joint_error, joint_velocity, torque (N, L, J)               rad, rad/s, N m, in URDF frames
     action, last_action (N, L, J)                               in leg frames
@@ -109,6 +109,8 @@ class LocomotionEnv:
         self._fault_odds, self.faults = zip(*faults)
         self.model = model = build_model(robot, terrain, **props(self.faults))
         self.world = world = Batch(model, nsim=num_envs, nthread=num_threads, persistent=True)
+        # bind: the live (N, ...) array of a field of MjData, read-only if it is no state. expand: a
+        # field of MjModel, shared by all robots until now, as (N, ...), a value for each of them.
         self._qpos, self._qvel, self._ctrl = map(world.bind, ("qpos", "qvel", "ctrl"))
         self._torque, self._contacts = map(world.bind, ("actuator_force", "sensordata"))
         self._friction = world.expand("geom_friction")
@@ -200,7 +202,7 @@ class LocomotionEnv:
         self._push()
         self._steer()
         self.history[:, :, :-1] = self.history[:, :, 1:]
-        self.history[:, :, -1] = self._frame()
+        self.history[:, :, -1] = self._newest_step()
 
         ended, late = np.flatnonzero(terminated | truncated), np.flatnonzero(truncated)
         info |= {"truncated_ids": late, "final_observation": self.observe(late)}
@@ -282,7 +284,7 @@ class LocomotionEnv:
         old = self.command_age[ids] >= round(config.command_seconds / CONTROL_DT)
         self._resample_commands(ids[old])
         self._steer()
-        self.history[ids] = self._frame()[ids, :, None]  # as though it had always stood like this
+        self.history[ids] = self._newest_step()[ids, :, None]  # as though it always stood like this
 
     def strike(self, ids, anew: bool = False, ago: int = 0) -> None:
         """Gives the robots `ids` what is wrong at this step; anew: even if it is what they have;
@@ -348,8 +350,8 @@ class LocomotionEnv:
         self.touchdown = self.foot_contact & (self.air_time > 0)
         self.air_time += CONTROL_DT
 
-    def _frame(self) -> np.ndarray:
-        """(N, L, 21), the newest step of every leg's history."""
+    def _newest_step(self) -> np.ndarray:
+        """(N, L, 21), what every leg sees now."""
         seen = self.joint_error, self.joint_velocity, self.linear_velocity, self.angular_velocity
         sensed = self.fault_writer.senses.read(*seen, self.gravity)
         angle, velocity, linear, angular, gravity = sensed

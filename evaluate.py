@@ -1,4 +1,4 @@
-"""The paper's experiments. Each is one function below, named as on the command line.
+"""The paper's experiments, each a function named as on the command line; ours are in beyond.py.
 
     python evaluate.py stiffness    # every shipped checkpoint (or --checkpoints FILE ...)
     python evaluate.py gaits --methods rolt --episodes 8 --seconds 10 --out /tmp/quick
@@ -14,7 +14,6 @@ mechanisms and dropout_ratio ignore --episodes and --seconds. The same --seed, t
 import argparse
 import os
 import sys
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -25,19 +24,18 @@ import plots
 import watch
 from baselines import METHODS
 from checkpoint import load_policy
-from env import CONTROL_DT, LocomotionEnv
+from env import CONTROL_DT
 from faults import HEALTHY, REAL_WORLD, TASKS, first_task
 from noise import HEIGHT_SCALE, NoisyScan
-from ppo import Critic, PPOConfig, RolloutBuffer, collect, to_tensors
+from ppo import to_tensors
 from report import claims, compare, report
 from robots import ROBOTS
-from rolt import GRID, NUM_PATCHES, PATCH, ROLT, Observation
+from rolt import GRID, NUM_PATCHES, PATCH
 from terrain import Terrain, rise
 from walk import duty, origin, take_a_walk, walk_cases, write_csv
 
 STAIRS_LEVEL = 0  # of the noise tests, ours: steps of 5 cm, the easiest of legged_gym
 NOISE_SCALES = (0.0, 0.05, 0.1, 0.15, 0.2, 0.3, 0.4)  # m, ours
-GATE = 0.1  # standard deviations of an action, ours: less is no mechanism
 WALKED = {"distance_m": "distance walked [m]", "fell": "share of falls", "success": "success"}
 
 
@@ -45,7 +43,11 @@ def fault_test(args, policies, name: str, case_name) -> None:
     """One fault at a time, seen in training or not, 0.75 m/s. case_name: of a joint's."""
     task = TASKS[args.task]
     faults = *task.seen, *task.unseen
-    cases = {case_name(f.split(":")[1]) if f.count(":") == 1 and "_" in f else f: f for f in faults}
+    cases = {}
+    for fault in faults:
+        parts = fault.split(":")
+        one_joint = len(parts) == 2 and "_" in fault  # and no number: the paper has a name for it
+        cases[case_name(parts[1]) if one_joint else fault] = fault
     seen = [case for case, fault in cases.items() if fault in task.seen]
     rows = walk_cases(args, policies, cases, speed=0.75)
     title = f"{name} test: {args.robot}, 0.75 m/s, {args.seconds:g} s"
@@ -126,8 +128,9 @@ def attention(args, policies) -> None:
         sys.exit("error: attention on patches is of ROLTs that read the scan: choose --checkpoints")
     *_, (walker, _) = policies.values()
     course, seen = Terrain(("stairs",), (STAIRS_LEVEL,) * 3), []
-    how = [HEALTHY], 0.5, 4.0, args.seed, args.threads
-    if take_a_walk(walker, args.robot, *how, seen, terrain=course).fell.any():
+    how = {"speed": 0.5, "seconds": 4.0, "seed": args.seed, "threads": args.threads}
+    walk = take_a_walk(walker, args.robot, [HEALTHY], **how, observations=seen, terrain=course)
+    if walk.fell.any():
         sys.exit("error: the policy that walks falls within 4 s: try another --seed")
     blind = NoisyScan(1, None, "missing:4", args.seed)
     blind.draw(np.array([0]))
@@ -172,93 +175,6 @@ def gaits(args, policies) -> None:
     plots.gait_diagrams(panels, legs, CONTROL_DT, len(policies), args.out / "gaits.png", title)
 
 
-def mechanisms(args, policies) -> None:
-    """Is what the claims rest on alive? How much a method's actions change in a healthy walk, in
-    their standard deviations, when a part of it is disturbed: an ablation is worth comparing if it
-    takes away 0.1 or more. Then how well a linear probe names a leg from its history (by chance 1
-    in L), and each foot's share of the time down: a fault on a leg below 0.1 tests nothing."""
-    rows = []
-    for path, (policy, card) in policies.items():
-        course = Terrain(("stairs",), (-1,) * 3) if card["task"] == "terrain" else None
-        how, seen = ([HEALTHY] * 32, 0.5 if course else 0.75, 6.0, args.seed, args.threads), []
-        walk = take_a_walk(policy, args.robot, *how, seen, terrain=course)
-        up = ~walk.fell | walk.fell.all()  # all, if none stays up
-        fields = zip(*(seen[100::10] or seen))  # every tenth step from 2 s on
-        states = Observation(*(torch.tensor(np.array(x)[:, up]).flatten(0, 1) for x in fields))
-        shares = zip(walk.env.robot.legs, duty(walk, range(32)))
-        numbers = {f"duty of {leg}": share for leg, share in shares}
-        actions = policy(states)
-        for name, other in disturbances(policy, states):
-            change = (policy(other) - actions) / actions.std(0)
-            numbers[name] = change.square().mean().sqrt().item()
-        numbers["leg named by its history"] = leg_probe(states.legs)
-        row = origin(path, card)
-        rows += [row | {"case": name, "value": f"{x:.4f}"} for name, x in numbers.items()]
-    columns = {"value": "change of the actions [their deviation]; share"}
-    report(args, rows, columns, f"Mechanisms: {args.robot}")
-    dead = [f"{row['method']}, {row['case']}" for row in rows if float(row["value"]) < GATE]
-    print(f"\nbelow the gate of {GATE}:", "; ".join(dead) or "nothing")
-
-
-def disturbances(policy, states: Observation):
-    """(what, the observation or the policy so disturbed), of those that the policy has."""
-    other = torch.arange(len(states.legs)).roll(len(states.legs) // 2)  # another robot's
-    if states.heights.numel():
-        yield "scan turned round", states._replace(heights=states.heights.flip(1))
-        yield "another's scan", states._replace(heights=states.heights[other])
-    yield "another's action token", states._replace(action=states.action[other])
-    yield "another's legs", states._replace(legs=states.legs[other])
-    for part in ("patch", "leg"):
-        if (position := getattr(policy, f"{part}_position", None)) is not None:
-            kept = position.clone()
-            position.copy_(position.mean(0).expand_as(position))
-            yield f"{part} positions equal", states
-            position.copy_(kept)
-
-
-def leg_probe(legs: torch.Tensor) -> float:
-    """Share of (B, L, H, frame) histories whose leg a linear fit to their first half can name."""
-    B, L = legs.shape[:2]
-    x = torch.cat([legs.flatten(2), torch.ones(B, L, 1)], dim=2).double()
-    a, b = x[: B // 2].flatten(0, 1), torch.eye(L).double().repeat(B // 2, 1)
-    weights = torch.linalg.solve(a.T @ a + 1e-2 * len(a) * torch.eye(a.shape[1]).double(), a.T @ b)
-    named = (x[B // 2 :] @ weights).argmax(2)
-    return (named == torch.arange(L)).double().mean().item()
-
-
-def dropout_ratio(args, policies) -> None:
-    """Not in the paper, but its case for consistency (section III-C) in one picture: PPO's ratio
-    before any weight has moved, where it should be 1. The first policy collects a rollout at every
-    rate; the update has its masks (consistent dropout), fresh (ordinary) or none (Roll-Drop)."""
-    (policy, card), *_ = policies.values()
-    if not isinstance(policy, ROLT):
-        sys.exit(f"error: {card['policy']} is no ROLT and has no feature dropout")
-    rows, faults, extras = [], TASKS["stiffness"].training, (*policy.extras, "privileged")
-    for rate in (1e-4, 1e-3, 1e-2, 0.05, 0.1, 0.2):
-        config = replace(policy.config, feature_dropout=rate)
-        model = ROLT(policy.num_legs, policy.num_joints, config)
-        model.load_state_dict(policy.state_dict())
-        env = LocomotionEnv(args.robot, 64, args.seed, 1, faults, extras=extras)
-        observation = env.reset(random_ages=True)
-        generator = torch.Generator().manual_seed(args.seed)
-        critic, masks = Critic(observation), model.sample_masks(64, generator)
-        buffer = RolloutBuffer(PPOConfig.steps, observation, env.num_actions, masks, "cpu")
-        for _ in range(2):  # what counts is the second, after half a second of walking
-            observation, _ = collect(env, model, critic, buffer, observation, generator)
-        batch = buffer.minibatch(torch.arange(len(buffer)))
-        fresh = model.sample_masks(len(buffer), generator)
-        schemes = {"stored masks": batch["masks"], "fresh masks": fresh, "no masks": None}
-        for scheme, masks in schemes.items():
-            actions = torch.distributions.Normal(model(batch["observation"], masks), buffer.std)
-            ratio = (actions.log_prob(batch["action"]).sum(-1) - batch["log_prob"]).exp()
-            clipped = ((ratio - 1).abs() > PPOConfig.clip).float().mean().item()
-            off = ratio.log().abs().median().exp().item()
-            row = {"method": scheme, "seed": card["seed"], "case": f"{rate:g}"}
-            rows.append(row | {"clipped": f"{clipped:.4f}", "off_by": f"{off:.4f}"})
-    columns = {"off_by": "factor by which the ratio is off (median)", "clipped": "share clipped"}
-    report(args, rows, columns, "PPO's ratio before any weight has moved", x="feature dropout rate")
-
-
 # name -> (function, task of its checkpoints (None: the robot's first), default robot and methods)
 EXPERIMENTS = {
     "stiffness": (stiffness, "stiffness", "a1", METHODS),
@@ -275,8 +191,8 @@ EXPERIMENTS = {
     "sudden": (beyond.sudden, None, "a1", METHODS),
     "matrix": (beyond.matrix, None, "a1", METHODS),
     "senses": (beyond.senses, None, "a1", METHODS),
-    "mechanisms": (mechanisms, None, "a1", METHODS),
-    "dropout_ratio": (dropout_ratio, "stiffness", "a1", ("rolt",)),
+    "mechanisms": (beyond.mechanisms, None, "a1", METHODS),
+    "dropout_ratio": (beyond.dropout_ratio, "stiffness", "a1", ("rolt",)),
 }
 
 
@@ -341,6 +257,8 @@ def main(argv: list[str] | None = None) -> None:
     except KeyboardInterrupt:
         sys.exit("\nstopped; nothing was written")
     except (ValueError, OSError, ArithmeticError, MemoryError) as error:
+        if sys.flags.dev_mode:  # python -X dev evaluate.py ...: where was it?
+            raise
         sys.exit(f"error: {error}")
 
 

@@ -91,9 +91,9 @@ def export(path: Path, out: Path) -> None:
     again, states = torch.export.load(out / "policy.pt2").module(), 0
     for _ in range(50):
         action = policy(observation)
-        told = again(*(getattr(observation, name) for name in inputs))
-        if not torch.equal(told, action):
-            gap = (told - action).abs().max()
+        answer = again(*(getattr(observation, name) for name in inputs))
+        if not torch.equal(answer, action):
+            gap = (answer - action).abs().max()
             raise RuntimeError(f"the program's actions differ from the policy's by {gap}")
         observation, states = to_tensors(env.step(action.numpy())[0], "cpu"), states + len(action)
     print(f"written: {out}/policy.pt2, policy.json, robot.mjb; equal to the bit in {states} states")

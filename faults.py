@@ -58,17 +58,18 @@ class Harm(NamedTuple):
     part: str  # a joint, a leg, a body
     size: float  # the word's number; 0 if it has none, so locks and dead motors scale torque by 0
     word: str  # all of it but for the time
-    first: int = 0  # step
-    last: float = math.inf  # step at which it has ended
-    period: int = 0  # steps; if any, it lasts `last` of each, from a moment that is drawn
+    start: int = 0  # step
+    end: float = math.inf  # step at which it is over
+    period: int = 0  # steps; if any, it strikes once in each, at a moment that is drawn,
+    length: int = 0  # and lasts so many
 
     def is_on(self, step: int, luck: tuple[int, ...]) -> bool:
         """luck: what moments are drawn from."""
         if not self.period:
-            return self.first <= step < self.last
+            return self.start <= step < self.end
         turn, step = divmod(step, self.period)
-        start = np.random.default_rng((*luck, turn)).integers(self.period - self.last + 1)
-        return start <= step < start + self.last
+        start = np.random.default_rng((*luck, turn)).integers(self.period - self.length + 1)
+        return start <= step < start + self.length
 
 
 @cache
@@ -93,20 +94,20 @@ def harms_of(fault: str) -> tuple[Harm, ...]:
     return tuple(harms)
 
 
-def _steps(when: str, kind: str) -> tuple[int, float, int]:
-    """Harm's first, last and period of "5:12", "5:" or "0.3/2"."""
+def _steps(when: str, kind: str) -> tuple:
+    """Harm's start, end, period and length of "5:12", "5:" or "0.3/2"."""
     short = kind == "blow"  # a blow is over after one step
     if "/" in when:
         length, period = (round(float(x) / CONTROL_DT) for x in when.split("/"))
         if not 1 <= length <= period:
             raise ValueError("after @ a length / a period, not shorter, in s")
-        return 0, 1 if short else length, period
-    start, end = when.split(":")
-    first = round(float(start) / CONTROL_DT)
-    last = round(float(end) / CONTROL_DT) if end else math.inf
-    if not 0 <= first < last:
+        return 0, math.inf, period, 1 if short else length
+    first, last = when.split(":")
+    start = round(float(first) / CONTROL_DT)
+    end = round(float(last) / CONTROL_DT) if last else math.inf
+    if not 0 <= start < end:
         raise ValueError("after @ a start and a later end, in s, as in @5:12 or @5:")
-    return first, first + 1 if short else last, 0
+    return start, start + 1 if short else end
 
 
 def fault_now(fault: str, step: int, luck: tuple[int, ...]) -> str:
@@ -205,12 +206,12 @@ class Senses:
         joints = np.stack([angle, velocity], axis=1)  # (N, 2, L, J)
         flat = joints.reshape(self.held.shape)
         self.held = np.where(np.isnan(self.held), flat, self.held)
-        told = self.gain * np.where(self.frozen, self.held, flat) + self.bias
+        sensed = self.gain * np.where(self.frozen, self.held, flat) + self.bias
         cos, sin = np.cos(self.pitch), np.sin(self.pitch)
         turned = []
         for x, y, z in (angular.T, gravity.T):
             turned.append(np.stack([cos * x - sin * z, y, sin * x + cos * z], axis=1))
-        return [*told.reshape(joints.shape).swapaxes(0, 1), self.speed * linear, *turned]
+        return [*sensed.reshape(joints.shape).swapaxes(0, 1), self.speed * linear, *turned]
 
 
 class FaultWriter:
@@ -226,12 +227,13 @@ class FaultWriter:
         self.expect(faults)
 
     def expect(self, faults: list[str]) -> None:
-        """Which may come: whose time comes later is checked now (ValueError), and what critics are
-        told is of these: `told` (N, M), the sizes of `other_harms`."""
+        """Which may come. Those that strike later are tried now, so that a wrong one is an error at
+        the start. `told`, (N, M): what critics hear of each of `other_harms`, its size."""
         self.timed = np.array(["@" in fault for fault in faults])
         for fault in faults:
-            if any(harm.kind == "blow" and harm.last == math.inf for harm in harms_of(fault)):
-                raise ValueError(f"when is the blow of {fault}? As in blow:trunk:5@3:")
+            for harm in harms_of(fault):
+                if harm.kind == "blow" and harm.end == math.inf and not harm.period:
+                    raise ValueError(f"when is the blow of {fault}? As in blow:trunk:5@3:")
             if "@" in fault:
                 self.model("+".join(harm.word for harm in harms_of(fault)))
         self.columns = other_harms(faults)

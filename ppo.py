@@ -174,8 +174,8 @@ def ppo_loss(
 
 
 def adapt_learning_rate(rate: float, kl: float, target: float) -> float:
-    """legged_gym's rule: slower when the policy moved too far, faster when it hardly moved. Once an
-    update, not after each minibatch: there KL is 0 at first and noisy then (NOTES 7)."""
+    """legged_gym's rule, but once an update (NOTES 7): slower when the policy moved too far, faster
+    when it hardly moved."""
     if kl > 2 * target:
         return max(1e-5, rate / 1.5)
     return min(1e-2, rate * 1.5) if 0 < kl < target / 2 else rate

@@ -52,6 +52,10 @@ def mean_and_interval(seeds: list[np.ndarray]) -> tuple[float, float, float]:
     return mean, *interval(bootstrap(seeds, np.random.default_rng(0)))
 
 
+def with_interval(mean: float, low: float, high: float) -> str:
+    return f"{mean:.2f} ({low:.2f} to {high:.2f})" if low < high else f"{mean:.2f}"
+
+
 def interquartile_mean(scores: np.ndarray) -> tuple[float, float, float]:
     """Of (S, C) the mean of the middle half, and its 95 %: seeds drawn for each case by itself."""
     (S, C), rng = scores.shape, np.random.default_rng(0)
@@ -113,7 +117,7 @@ def compare(rows: list[dict], groups: dict[str, list[str]], best: str = "rolt") 
         for method in methods:
             theirs = scores(rows, method, cases)
             iqm, low, high = interquartile_mean(theirs)
-            line = f"| {method} | {iqm:.2f}" + f" ({low:.2f} to {high:.2f})" * (low < high)
+            line = f"| {method} | {with_interval(iqm, low, high)}"
             if ours is None or method == best:
                 print(line, "| | |")
                 continue
@@ -146,7 +150,7 @@ def report(args, rows: list[dict], columns: dict[str, str], title: str, seen=(),
                 seeds = by_seed(rows, column, method=method, case=case)
                 mean, low, high = mean_and_interval(seeds) if seeds else (np.nan,) * 3
                 panels[what][head].append((mean, low, high, [x.mean() for x in seeds]))
-                line += f" {mean:.2f}" + f" ({low:.2f} to {high:.2f})" * (low < high)
+                line += f" {with_interval(mean, low, high)}"
                 line += " * |" if (method, case) in unused else " |"
             print(line)
     if unused:

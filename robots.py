@@ -2,8 +2,7 @@
 
 A robot is a trunk and L equal legs of J joints, of which the front right one is written down: left
 legs are its mirror image in y, rear legs in x where `Link.rear_mirrors_x` says so. Legs are called
-FR, FL, RR, RL (front or rear; the hexapod's front, middle, hind), their joints hip, thigh, calf. A
-new robot is a `Robot(...)` at the end of this file and an entry in `ROBOTS`.
+FR, FL, RR, RL (front or rear; the hexapod's front, middle, hind), their joints hip, thigh, calf.
 
 What a fault (faults.py) changes on one robot is prepared here:
 

@@ -12,9 +12,8 @@ Why no position embedding on the legs: with one, each leg learns a controller of
 the front right leg has learned about limping stays there. Without one the legs share everything; a
 leg finds out where it is by comparing its own previous action with the action token.
 
-Why the masks are data: PPO compares the policy that acted with the one that is updated. Drawn anew,
-dropout would make them differ before a single weight has moved. So the rollout's masks are stored
-with the transition and passed to `forward` again (ppo.py); None, at test, means no dropout.
+Why the masks are data: the rollout's are stored with the transition and passed to `forward` again
+when PPO updates the policy, which else would differ from the one that acted (ppo.py).
 
 Legend: B samples, L legs, J joints a leg, H = 10 steps of history, P = 12 patches, D = 160 width,
 T tokens: L, the action token, and P where the policy reads the scan.
@@ -106,8 +105,8 @@ class EncoderLayer(nn.Module):
     def forward(self, x: Tensor, queries: int, keep_attention, keep_feedforward):
         """Updates the first `queries` tokens of x (B, T, D); masks are (B, queries, D) or None.
 
-        To leave out those that nobody reads afterwards changes nothing in the rest: what a token
-        becomes depends on the other tokens' keys and values, never on their queries.
+        The others still serve as keys and values, so these become what they would if all were
+        updated: a token depends on the others' keys and values, never on their queries.
         Returns: tokens (B, queries, D), attention weights (B, heads, queries, T)."""
         normed = self.norm_attention(x)
         x = x[:, :queries]

@@ -98,8 +98,7 @@ class Terrain:
         return np.where(row < len(self.levels), row, rng.integers(len(self.levels), size=len(row)))
 
 
-# Two fifths of the robots learn on stairs, where the tests are. Steps of 1.4 to 12.2 cm for a robot
-# that stands 30 cm high; a run that began at level 0 (5 cm) learned to stand in front of them.
+# Two fifths of the robots learn on stairs, where the tests are: steps of 1.4 to 12.2 cm (NOTES 17).
 TRAINING_MAP = Terrain(("stairs", "slope", "stairs", "platforms", "flat"), tuple(range(-2, 5)))
 _SHADES = [0.80, 0.77, 0.72, 1], [0.55, 0.53, 0.50, 1]  # one step from the next
 

@@ -110,7 +110,8 @@ class StageRun:
     """A stage under way (most methods have one): its robots, buffer, critic and learner."""
 
     def __init__(self, number: int, stage: Stage, args, rank: int, policy, device, critic=None):
-        """critic: the last stage's, kept by one that trains none, for who starts from this run."""
+        """critic: of the stage before. One that trains none (RMA's adaptation) keeps it, so that
+        --init can start from this run."""
         n, local = args.envs // args.processes, os.environ.get("LOCAL_WORLD_SIZE", args.processes)
         self.number, self.actor = number, stage.actor
         self.env = LocomotionEnv(
@@ -318,8 +319,13 @@ def main(argv: list[str] | None = None) -> None:
     with tempfile.TemporaryDirectory() as folder:
         others = (args, f"file://{folder}/sync")
         context = torch.multiprocessing.spawn(guarded, others, args.processes, join=False)
-        for number in (signal.SIGINT, signal.SIGTERM):  # the processes save and end by themselves
-            signal.signal(number, lambda *_: [p.terminate() for p in context.processes])
+
+        def stop(*_) -> None:  # the processes save and end by themselves
+            for process in context.processes:
+                process.terminate()
+
+        signal.signal(signal.SIGINT, stop)
+        signal.signal(signal.SIGTERM, stop)
         try:
             while not context.join():
                 pass

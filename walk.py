@@ -51,9 +51,9 @@ def show_progress(label: str, done: int, total: int, start: float) -> None:
 
 @torch.no_grad()
 def take_a_walk(
-    policy, robot, faults, speed, seconds, seed=0, threads=0, seen=None, label="", **sim
+    policy, robot, faults, speed, seconds, seed=0, threads=0, observations=None, label="", **sim
 ) -> Walk:
-    """Robot i with faults[i], at speed m/s. seen: a list to which each step's observation is added.
+    """Robot i with faults[i], at speed m/s. observations: a list to which each step's is added.
     label: of the progress that is shown. sim: options of LocomotionEnv, as terrain and noise. A
     fall: the trunk on the ground or tilted by more than 60 degrees, or a simulation that diverges
     (which is said on stderr)."""
@@ -69,8 +69,8 @@ def take_a_walk(
     for t in range(T):
         poses.append(env.world.bind("qpos").copy())
         contacts.append(env.world.bind("sensordata")[:, feet] > 0)
-        if seen is not None:
-            seen.append(observation)
+        if observations is not None:
+            observations.append(observation)
         action = policy(to_tensors(observation, "cpu")).numpy()
         observation, reward, terminated, _, info = env.step(action)
         divergences += (upright & info["diverged"]).sum()
@@ -111,13 +111,15 @@ def walk_cases(
     what else is wanted of robot i."""
     labels = [(case, episode) for case in cases for episode in range(args.episodes)]
     faults = [cases[case] for case, _ in labels]
-    how, rows = (speed, args.seconds, args.seed, args.threads), []
+    how = {"speed": speed, "seconds": args.seconds, "seed": args.seed, "threads": args.threads}
+    rows = []
     for path, (policy, card) in policies.items():
         label = f"{card['policy']}, seed {card['seed']}, {', '.join(cases)}"[:60]
-        walk = take_a_walk(policy, args.robot, faults, *how, label=label, **sim)
+        walk = take_a_walk(policy, args.robot, faults, label=label, **how, **sim)
         healthy, sound = [i for i, fault in enumerate(faults) if fault == HEALTHY], walk
         if not healthy:  # it takes a walk of its own to know
-            healthy, sound = range(8), take_a_walk(policy, args.robot, [HEALTHY] * 8, *how, **sim)
+            healthy = range(8)
+            sound = take_a_walk(policy, args.robot, [HEALTHY] * 8, **how, **sim)
         duties = dict(zip(sound.env.robot.legs, duty(sound, healthy)))
         for i, (case, episode) in enumerate(labels):
             parts = [harm.part.split("_")[0] for harm in harms_of(faults[i])]

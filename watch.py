@@ -25,12 +25,12 @@ from PIL import Image
 
 from checkpoint import load_policy
 from env import CONTROL_DT, LocomotionEnv
-from faults import REAL_WORLD, TASKS, fault_now, faulty_model, first_task, harms_of, props
+from faults import REAL_WORLD, TASKS, faulty_model, first_task, harms_of, props
 from ppo import to_tensors
 from robots import ROBOTS
 from rolt import ROLT
 from terrain import Terrain
-from walk import straight_ahead, take_a_walk
+from walk import straight_ahead
 
 HELP = "type a fault (lock:RL_calf, healthy), a speed (0.5), noise (sigma:0.1), again or quit"
 
@@ -43,47 +43,6 @@ def painted(env: LocomotionEnv, fault: str) -> mujoco.MjModel:
         if any(body.name == part or body.name.startswith(f"{part}_") for part in parts):
             model.geom_rgba[model.geom_bodyid == body.id] = [0.85, 0.2, 0.15, 1]
     return model
-
-
-def film(args, policy, terrain: Terrain | None) -> None:
-    """Writes --out: from 2 s on, every second step up to the first fall."""
-    how = [args.fault], args.speed, 2 + args.seconds, args.seed
-    walk = take_a_walk(policy, args.robot, *how, terrain=terrain, noise=args.noise)
-    steps = range(round(2 / CONTROL_DT), walk.steps[0], 2)
-    if not steps:
-        raise RuntimeError(f"with {args.fault} the robot falls within 2 s: nothing to show")
-    model, colours = painted(walk.env, "healthy"), {}
-    try:
-        if sys.platform == "linux" and "MUJOCO_GL" not in os.environ:  # without asking a display
-            from mujoco import egl
-
-            mujoco.rendering.classic.gl_context.GLContext = egl.GLContext
-        renderer = mujoco.Renderer(model, height=300, width=480)
-    except Exception as error:  # each backend fails in its own way
-        way_out = "install libegl1, or try MUJOCO_GL=glfw (a display) or osmesa (libosmesa6)"
-        raise RuntimeError(f"cannot draw ({error}): {way_out}") from error
-
-    data, camera, frames = mujoco.MjData(model), mujoco.MjvCamera(), []
-    camera.distance = 1.3 * max(1.0, walk.env.robot.trunk_box[0] / 0.38)  # m, the whole robot
-    camera.elevation = -18
-    camera.azimuth = 60 if terrain else 125  # from behind, stairs show their steps
-    for step in steps:
-        now = fault_now(args.fault, step, (args.seed, 0, 1))  # robot 0, first episode: as in env
-        if now not in colours:
-            colours[now] = painted(walk.env, now).geom_rgba
-        model.geom_rgba[:] = colours[now]
-        data.qpos[:] = walk.poses[step, 0]
-        mujoco.mj_fwdPosition(model, data)
-        camera.lookat[:] = data.qpos[:3] - [0, 0, 0.08]  # on flat ground 0.2 m up
-        renderer.update_scene(data, camera)
-        frames.append(Image.fromarray(renderer.render()))
-    # one palette for all frames keeps the file small and the colours still, a fault's red too
-    some = Image.fromarray(np.vstack([np.array(frame) for frame in frames[::10]]))
-    palette = some.quantize(64, Image.Quantize.FASTOCTREE)
-    first, *rest = (frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames)
-    pace = {"duration": round(2000 * CONTROL_DT), "loop": 0}  # ms a frame
-    first.save(args.out, save_all=True, append_images=rest, optimize=True, **pace)
-    print(f"written: {args.out}")
 
 
 class Show:
@@ -155,12 +114,57 @@ class Show:
             parts = weights.split([len(weights), *self.policy.others.values()], dim=1)
             shares = [part.sum(1).tolist() for part in parts]
             self.attention = dict(zip(("legs", *self.policy.others), shares))
-        if fallen[0]:
-            print("it fell and starts over", flush=True)
+        self.fell = fallen[0]
+        if self.fell:
+            print("it fell", flush=True)
         if self.env.fault_now[0] != self.shown:
             self.repaint()
         self.data.qpos[:] = self.env.world.bind("qpos")[0]
         self.data.time += CONTROL_DT
+
+
+def film(show: Show, out: Path, seconds: float) -> None:
+    """From 2 s on, every second step up to the first fall."""
+    model = show.model
+    try:
+        if sys.platform == "linux" and "MUJOCO_GL" not in os.environ:  # without asking a display
+            from mujoco import egl
+
+            mujoco.rendering.classic.gl_context.GLContext = egl.GLContext
+        renderer = mujoco.Renderer(model, height=300, width=480)
+    except Exception as error:  # each backend fails in its own way
+        way_out = "install libegl1, or try MUJOCO_GL=glfw (a display) or osmesa (libosmesa6)"
+        raise RuntimeError(f"cannot draw ({error}): {way_out}") from error
+
+    camera, frames = mujoco.MjvCamera(), []
+    camera.distance = 1.3 * max(1.0, show.env.robot.trunk_box[0] / 0.38)  # m, the whole robot
+    camera.elevation = -18
+    camera.azimuth = 60 if show.terrain else 125  # from behind, stairs show their steps
+    for step in range(round((2 + seconds) / CONTROL_DT)):
+        show.step()
+        if show.fell:
+            break
+        if step * CONTROL_DT >= 2 and step % 2 == 0:
+            model.geom_rgba[:] = show.model.geom_rgba  # a fault may have come or gone
+            mujoco.mj_fwdPosition(model, show.data)
+            camera.lookat[:] = show.data.qpos[:3] - [0, 0, 0.08]  # on flat ground 0.2 m up
+            renderer.update_scene(show.data, camera)
+            frames.append(Image.fromarray(renderer.render()))
+    if not frames:
+        raise RuntimeError(f"with {show.fault} the robot falls within 2 s: nothing to show")
+    # one palette for all frames keeps the file small and the colours still, a fault's red too
+    some = Image.fromarray(np.vstack([np.array(frame) for frame in frames[::10]]))
+    palette = some.quantize(64, Image.Quantize.FASTOCTREE)
+    first, *rest = (frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames)
+    pace = {"duration": round(2000 * CONTROL_DT), "loop": 0}  # ms a frame
+    first.save(out, save_all=True, append_images=rest, optimize=True, **pace)
+    print(f"written: {out}")
+
+
+def listen(show: Show) -> None:
+    """Words from the terminal."""
+    for line in sys.stdin:
+        show.words.put(line)
 
 
 def view(show: Show, public: bool, port: int) -> None:
@@ -249,15 +253,17 @@ def main(argv: list[str] | None = None) -> None:
         shipped = Path(__file__).parent / f"checkpoints/{args.robot}-{task}-rolt.pt"
         policy, _ = load_policy(args.checkpoint or os.path.relpath(shipped), args.robot)
         terrain = None if args.stairs is None else Terrain(("stairs",), (args.stairs,) * 9)
-        if args.out:
-            return film(args, policy, terrain)
         show = Show(policy, args.robot, args.fault, args.speed, args.seed, terrain, args.noise)
+        if args.out:
+            return film(show, args.out, args.seconds)
         print(HELP)
-        threading.Thread(target=lambda: [*map(show.words.put, sys.stdin)], daemon=True).start()
+        threading.Thread(target=listen, args=(show,), daemon=True).start()
         view(show, args.public, args.port)
     except KeyboardInterrupt:
         pass
     except (ValueError, RuntimeError, ImportError, OSError, ArithmeticError) as error:
+        if sys.flags.dev_mode:
+            raise
         sys.exit(f"error: {error}")
 
 
