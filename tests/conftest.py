@@ -15,10 +15,13 @@ ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))
 
 import checkpoint
-from baselines import make_policy
+import train
+from baselines import make_policy, training_stages
 from env import EnvConfig, LocomotionEnv
 from faults import TASKS
-from robots import ROBOTS
+from ppo import collect, mean_action
+from robots import A1, ROBOTS
+from rolt import Decoder
 
 CARD = {"robot": "a1", "task": "stiffness", "policy": "rolt", "scan": False}
 CARD |= {"seed": 0, "steps": 0, "stages": {}, "init": None, "curve": torch.ones(2, 5)}
@@ -36,6 +39,37 @@ def save_policy(path, weights=None, **card):
         weights = make_policy(card["policy"], robot, task, card["scan"]).state_dict()
     checkpoint.save(card | {"weights": weights, "critic": {}}, Path(path))
     return str(path)
+
+
+def fresh_policy(name, task="stiffness", scan=False):
+    """For the A1; the small last layer, which would hide differences, made large."""
+    torch.manual_seed(0)
+    policy = make_policy(name, A1, TASKS[task], scan)
+    for module in policy.modules():
+        if isinstance(module, Decoder):
+            torch.nn.init.normal_(module.weight, std=0.2)
+    return policy
+
+
+def rollout_of(policy, stage=0, n=8, precision="fp32"):
+    """A stage of the training (train.py) with one rollout in its buffer, and the generator."""
+    words = f"--envs {n} --epochs 2 --minibatches 2 --threads 1 --precision {precision} --out none"
+    args = train.parse_arguments([*words.split(), "--device", "cpu"])
+    stage = training_stages(policy, TASKS["stiffness"])[stage]
+    run = train.StageRun(0, stage, args, 0, policy, "cpu")
+    generator = torch.Generator().manual_seed(0)
+    collect(
+        run.env, run.actor, run.critic, run.buffer, run.observation, generator, run.learner.bf16
+    )
+    return run, generator
+
+
+def ratio(policy, batch, std, masks, bf16=False):
+    """PPO's, of a minibatch."""
+    with torch.no_grad():
+        mean = mean_action(policy, batch["observation"], masks, bf16)
+    log_prob = torch.distributions.Normal(mean, std).log_prob(batch["action"]).sum(-1)
+    return (log_prob - batch["log_prob"]).exp()
 
 
 def env_of(n, robot="a1", config=EnvConfig(), **options):
