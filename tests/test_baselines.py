@@ -31,7 +31,7 @@ def test_every_policy_acts_and_survives_saving(name, tmp_path):
     action = policy(observation)
     assert action.shape == (6, 12) and policy.std().shape == (12,)
     halved = {key: x.half() for key, x in policy.state_dict().items()}  # as checkpoint.py ships it
-    for weights, tolerance in ((policy.state_dict(), 0.0), (halved, 2e-3)):
+    for weights, tolerance in ((policy.state_dict(), 0.0), (halved, 1e-2)):
         save_policy(tmp_path / "policy.pt", weights, policy=name)
         copy, _ = checkpoint.load_policy(tmp_path / "policy.pt", "a1")
         if tolerance == 0.0 or name != "roam":  # whose choice among behaviours is a draw
