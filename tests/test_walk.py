@@ -1,6 +1,5 @@
 """Every number of the results: walks on a world that plays back what was written by hand, gaits."""
 
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -8,14 +7,14 @@ import pytest
 import torch
 
 import walk
+from beyond import recovery
 from baselines import METHODS, make_policy
 from checkpoint import load_policy
+from conftest import ROOT
 from env import CONTROL_DT, Observation
 from faults import HEALTHY, TASKS
 from robots import A1
 from terrain import Terrain
-
-ROOT = Path(__file__).resolve().parent.parent
 
 
 class Playback:
@@ -123,3 +122,21 @@ def test_methods_act_as_they_did_when_their_results_were_measured():
         how = policy, "a1", ["lock:FR_calf"], 0.75, 0.6, 0, 1
         poses = walk.take_a_walk(*how, terrain=course).poses
         assert poses[-1, 0, 0] == pytest.approx(x, abs=1e-3)
+
+
+def played(x: np.ndarray, steps: int, fell: bool) -> SimpleNamespace:
+    """A walk of one robot that is at x (T,) m."""
+    return SimpleNamespace(poses=x[:, None, None], steps=[steps], fell=[fell])
+
+
+def test_recovery_is_the_time_until_the_last_second_was_fast_enough():
+    """0.8 m/s; 0.2 m/s from 5 to 13 s; then 0.8: 80 % of that, 0.64, is the mean over a second of
+    which 0.733 were fast: 1 + 0.74 s after the fault's end, on the grid of 20 ms."""
+    t = np.arange(1000) * CONTROL_DT
+    x = np.where(t < 5, 0.8 * t, np.where(t < 13, 4 + 0.2 * (t - 5), 5.6 + 0.8 * (t - 13)))
+    told = recovery(played(x, 1000, False), 0)
+    assert float(told["recovery_s"]) == pytest.approx(1.74, abs=0.001)
+    assert float(told["during"]) == pytest.approx(0.25)
+    fallen = recovery(played(x, 700, True), 0)
+    assert float(fallen["recovery_s"]) == 8 and float(fallen["during"]) == pytest.approx(0.25)
+    assert recovery(played(x, 300, True), 0) == {"during": "0.000", "recovery_s": "8.000"}
