@@ -9,7 +9,7 @@ import torch
 
 import checkpoint
 from baselines import METHODS, ROLL_DROP_RATE, ROAMLearner, training_stages
-from conftest import env_of, env_with, fresh_policy, ratio, rollout_of, save_policy
+from conftest import env_of, fresh_policy, ratio, rollout_of, save_policy
 from faults import TASKS
 from ppo import proprioception, to_tensors
 
@@ -95,17 +95,6 @@ def test_rma_reads_nothing_privileged_at_test():
     assert torch.equal(policy(observation), policy(poisoned))
     told = observation._replace(past=torch.zeros(6, 0), privileged=torch.full((6, 25), math.nan))
     assert policy(told).isnan().all()  # in training it does
-
-
-def test_rma_and_roam_are_told_what_is_wrong():
-    env = env_with(*TASK.seen, extras=("privileged", "situation"))
-    observation = env.observe()
-    assert observation.situation.tolist() == [[0.0], [1.0]]
-    well, limping = observation.privileged
-    assert well[:12].sum() == 0 and well[12:24].tolist() == [1] * 12
-    assert limping[:12].tolist() == [0, 0, 1, *[0] * 9]
-    assert limping[12:24].tolist() == [1, 1, 0, *[1] * 9]
-    assert (well[24], limping[24]) == tuple(env._friction[:, 1, 0].astype("float32"))
 
 
 def test_roams_loss_by_hand():

@@ -15,12 +15,15 @@ ON_ITS_BACK = [0, 1, 0, 0]  # a quaternion
 
 
 def rollout(threads=1, seed=0):
-    env = LocomotionEnv("a1", 8, seed, threads, TASKS["stiffness"].training)
+    """Of robots on which locks come and go."""
+    env = LocomotionEnv("a1", 8, seed, threads, TASKS["mid-stride"].training)
     env.reset(random_ages=True)
     rng, trace = np.random.default_rng(1), []
     for _ in range(60):
         *answer, info = flail(env, rng)
-        trace += [*answer[0], *answer[1:], info["position"]]
+        locked = env.world.bind("eq_active").copy()
+        trace += [*answer[0], *answer[1:], info["position"], locked]
+    assert 0 < locked.sum() < 8
     return trace
 
 
@@ -274,7 +277,7 @@ BY_HAND = SimpleNamespace(
 )
 
 
-def test_reward_terms_by_hand_scaled_by_time_and_floored():
+def test_reward_terms_by_hand_scaled_by_time_and_floored_and_standing_earns_no_air_time():
     bad, terms = rewards.total_reward(BY_HAND, 0.02)
     assert {name: term[0] for name, term in terms.items()} == pytest.approx({
         "xy_velocity_tracking": 1.5 * np.exp(-1),
@@ -291,8 +294,5 @@ def test_reward_terms_by_hand_scaled_by_time_and_floored():
     good = SimpleNamespace(**(vars(BY_HAND) | {"link_contact": np.zeros((1, 8), bool)}))
     reward, terms = rewards.total_reward(good, 0.02)
     assert reward[0] == pytest.approx(0.02 * sum(t[0] for t in terms.values())) and reward[0] > 0
-
-
-def test_standing_earns_no_air_time():
     still = SimpleNamespace(**(vars(BY_HAND) | {"command": np.array([[0.0, 0.05, 0.9]])}))
     assert rewards.foot_air_time(still)[0] == 0.0

@@ -3,15 +3,11 @@
 import json
 import subprocess
 import sys
-from pathlib import Path
 
-import pytest
 import torch
 
 import export
-from conftest import save_policy
-
-ROOT = Path(__file__).resolve().parent.parent
+from conftest import ROOT, save_policy
 
 
 def test_the_shipped_policy_walks_on_plain_mujoco(tmp_path, capsys):
@@ -35,8 +31,3 @@ def test_policies_with_a_scan_or_a_long_memory_can_go_too(tmp_path):
         program = torch.export.load(tmp_path / policy / "policy.pt2").module()
         inputs = [torch.zeros(7, *x["shape"][1:]) for x in card["inputs"]]
         assert program(*inputs).shape == (7, 12)
-
-
-def test_what_draws_lots_stays(tmp_path):
-    with pytest.raises(SystemExit, match="error: ROAM draws its behaviour"):
-        export.main([save_policy(tmp_path / "p.pt", policy="roam"), str(tmp_path)])

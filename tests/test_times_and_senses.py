@@ -77,12 +77,6 @@ def test_what_comes_and_goes_repeats_with_the_seed():
     starts = np.flatnonzero(np.diff(pattern, prepend=False) & pattern) % 50
     assert len(starts) == 10 and len(set(starts.tolist())) > 5
     assert np.array_equal(again, pattern) and not np.array_equal(other, pattern)
-    envs = [env_with(fault, fault, num_threads=threads) for threads in (1, 2)]
-    rngs = [np.random.default_rng(0), np.random.default_rng(0)]
-    for _ in range(60):
-        one, two = (flail(env, rng) for env, rng in zip(envs, rngs))
-        assert np.array_equal(one[0].legs, two[0].legs) and envs[0].fault_now == envs[1].fault_now
-    assert envs[0].fault_now[0] in ("lock:FR_calf", HEALTHY)
 
 
 def test_a_late_motor_counts_in_steps_of_the_simulation():

@@ -7,8 +7,8 @@ import pytest
 import torch
 
 import walk
-from beyond import recovery
 from baselines import METHODS, make_policy
+from beyond import recovery
 from checkpoint import load_policy
 from conftest import ROOT
 from env import CONTROL_DT, Observation
@@ -55,20 +55,15 @@ def policy(monkeypatch):
     return type("Policy", (), {"extras": (), "leg_frames": True, "__call__": staticmethod(acts)})()
 
 
-def test_an_episode_ends_with_the_first_fall(policy):
-    faults = [HEALTHY, "lock:FR_calf"]
+def test_an_episode_ends_with_the_first_fall_or_where_a_simulation_that_diverges_last_was(
+    policy, capsys
+):
+    faults = [HEALTHY, "lock:FR_calf", "skate:FR"]
     walked = walk.take_a_walk(policy, "a1", faults, 0.75, 10 * CONTROL_DT)
-    assert walked.distance == pytest.approx([10 * 0.1, 3 * 0.2])
-    assert walked.fall_time == pytest.approx([10 * CONTROL_DT, 3 * CONTROL_DT])
-    assert walked.returns == pytest.approx([10, 3]) and walked.fell.tolist() == [False, True]
-
-
-def test_a_simulation_that_diverges_ends_where_it_last_was_and_is_told(policy, capsys):
-    faults = [HEALTHY, "skate:FR"]
-    walked = walk.take_a_walk(policy, "a1", faults, 0.75, 10 * CONTROL_DT)
-    assert walked.distance == pytest.approx([10 * 0.1, 3 * 0.2])
-    assert walked.returns == pytest.approx([10, 3])
-    assert walked.fall_time == pytest.approx([10 * CONTROL_DT, 4 * CONTROL_DT])
+    assert walked.distance == pytest.approx([10 * 0.1, 3 * 0.2, 3 * 0.3])
+    assert walked.fall_time == pytest.approx([10 * CONTROL_DT, 3 * CONTROL_DT, 4 * CONTROL_DT])
+    assert walked.returns == pytest.approx([10, 3, 3])
+    assert walked.fell.tolist() == [False, True, True]
     assert capsys.readouterr().err == "simulations that diverged, counted as falls: 1\n"
 
 
