@@ -128,6 +128,6 @@ def test_roam_acts_in_training_by_its_situation_and_at_test_by_its_values():
 
 def test_every_policy_that_acts_has_the_whole_budget():
     """What chooses among policies, or guesses, comes on top."""
-    names = "rolt", "mlp", "rma", "roam"
-    shares = [[stage.share for stage in training_stages(fresh_policy(name), TASK)] for name in names]
-    assert shares == [[1.0], [1.0], [1.0, 0.2], [1.0, 1.0, 0.2]]
+    budgets = {"rolt": [1.0], "mlp": [1.0], "rma": [1.0, 0.2], "roam": [1.0, 1.0, 0.2]}
+    for name, shares in budgets.items():
+        assert [stage.share for stage in training_stages(fresh_policy(name), TASK)] == shares

@@ -2,27 +2,20 @@
 
 import subprocess
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 from PIL import Image
 
 import watch
-from baselines import make_policy
-from conftest import save_policy
-from faults import HEALTHY, TASKS
-from robots import A1
+from conftest import ROOT, fresh_policy, save_policy
+from faults import HEALTHY
 from terrain import Terrain
-
-ROOT = Path(__file__).resolve().parent.parent
 
 
 @pytest.fixture
 def show():
-    torch.manual_seed(0)
-    policy = make_policy("rolt", A1, TASKS["terrain"], True)
+    policy = fresh_policy("rolt", "terrain", True)
     return watch.Show(policy, "a1", HEALTHY, 0.75, 0, Terrain(("stairs",), (0,)), "clean")
 
 
