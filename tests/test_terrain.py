@@ -92,7 +92,7 @@ def by_patch(points: np.ndarray) -> np.ndarray:
     return squares.reshape(n, 12, 16, *more)
 
 
-def test_low_frequency_noise_moves_whole_patches_by_its_scale():
+def test_low_frequency_noise_moves_whole_patches_by_its_scale_and_missing_ones_are_whole():
     shifts = drawn(2000, "offset:0.3").shift
     patches = by_patch(shifts)
     assert np.array_equal(patches, np.repeat(patches[:, :, :1], 16, axis=2))
@@ -102,6 +102,8 @@ def test_low_frequency_noise_moves_whole_patches_by_its_scale():
     assert np.allclose(directions.mean(0), 0, atol=0.03)
     assert np.allclose(directions.var(0), 1 / 3, atol=0.02)
     assert np.array_equal(shifts, drawn(2000, "offset:0.3").shift)
+    missing = by_patch(drawn(50, "missing:4").missing)
+    assert np.array_equal(missing.all(2), missing.any(2)) and np.all(missing.all(2).sum(1) == 4)
 
 
 def test_high_frequency_noise_has_its_scale_and_no_order():
@@ -115,11 +117,6 @@ def test_high_frequency_noise_has_its_scale_and_no_order():
     ramp = noisy.read(ids, position, yaw)[:, 6:10] / 20  # amid the scan, where nothing is clipped
     expected = scan(Ramp(), position, yaw)[:, 6:10] / 20
     assert (ramp - expected).std() == pytest.approx(0.1 * 2**0.5, rel=0.03)
-
-
-def test_missing_points_are_rolts_patches():
-    patches = by_patch(drawn(50, "missing:4").missing)
-    assert np.array_equal(patches.all(2), patches.any(2)) and np.all(patches.all(2).sum(1) == 4)
 
 
 def test_a_lateral_shift_reads_the_ground_elsewhere():
