@@ -102,6 +102,14 @@ def flail(env, rng, steps=1):
     return answer
 
 
+def go_on_alike(one, two, rng, steps):
+    """Both envs, given the same random actions, answer alike to the bit."""
+    for _ in range(steps):
+        action = rng.normal(size=(one.num_envs, one.num_actions))
+        a, b = one.step(action), two.step(action)
+        assert all(np.array_equal(x, y) for x, y in zip((*a[0], *a[1:4]), (*b[0], *b[1:4])))
+
+
 @pytest.fixture(autouse=True)
 def as_in_training():
     """A process has one thread, which also makes float sums repeatable. `train.main` catches the

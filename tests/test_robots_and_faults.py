@@ -111,7 +111,7 @@ def test_faults_add_up():
 
 
 def test_critics_are_told_of_every_harm():
-    """Locks, motors and friction read off the simulation, all else by its number; for ROAM which."""
+    """Locks, motors and friction read off the simulation, else by number; ROAM of which it is."""
     faults = ["healthy", "lock:FR_calf", "weaken:FL:0.5", "half-lock:RR_calf:-1.5", "skate:FR"]
     env = env_with(*faults, config=EnvConfig(), extras=("privileged", "situation"))
     observation = env.observe()

@@ -4,7 +4,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from conftest import env_of, env_with, flail, rest
+from conftest import env_of, env_with, flail, go_on_alike, rest
 from faults import HEALTHY, fault_now, faulty_model
 from robots import A1, build_model
 
@@ -60,10 +60,7 @@ def test_an_interrupted_env_goes_on_alike_in_the_middle_of_faults():
     whole, again, rng = env_with(ALL, HEALTHY), env_with(ALL, HEALTHY), np.random.default_rng(0)
     flail(whole, rng, 8)
     again.load_state_dict(whole.state_dict())
-    for _ in range(8):
-        action = rng.normal(size=(2, 12))
-        one, two = whole.step(action)[0], again.step(action)[0]
-        assert all(np.array_equal(x, y) for x, y in zip(one, two))
+    go_on_alike(whole, again, rng, 8)
 
 
 def test_what_comes_and_goes_repeats_with_the_seed():
