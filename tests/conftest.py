@@ -1,4 +1,4 @@
-"""Lets the tests import the scripts, wherever pytest is started from."""
+"""Lets the tests import the scripts, wherever pytest is started from; what several tests use."""
 
 import os
 import signal
@@ -7,18 +7,28 @@ from pathlib import Path
 
 os.environ["CUDA_VISIBLE_DEVICES"] = ""  # read by `import torch`; the tests are of the CPU
 
+import numpy as np
 import pytest
 import torch
 
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
+ROOT = Path(__file__).resolve().parent.parent
+sys.path.insert(0, str(ROOT))
 
 import checkpoint
-from baselines import make_policy
+import train
+from baselines import make_policy, training_stages
+from env import EnvConfig, LocomotionEnv
 from faults import TASKS
-from robots import ROBOTS
+from ppo import collect, mean_action
+from robots import A1, ROBOTS
+from rolt import Decoder
 
 CARD = {"robot": "a1", "task": "stiffness", "policy": "rolt", "scan": False}
 CARD |= {"seed": 0, "steps": 0, "stages": {}, "init": None, "curve": torch.ones(2, 5)}
+QUIET = EnvConfig(  # nothing is left to chance
+    push_speed=0.0, start_speed=0.0, start_pose=(1.0, 1.0), friction=(1.0, 1.0),
+    forward_speed=(0.5, 0.5), heading=(0.0, 0.0),
+)  # fmt: skip
 
 
 def save_policy(path, weights=None, **card):
@@ -29,6 +39,75 @@ def save_policy(path, weights=None, **card):
         weights = make_policy(card["policy"], robot, task, card["scan"]).state_dict()
     checkpoint.save(card | {"weights": weights, "critic": {}}, Path(path))
     return str(path)
+
+
+def fresh_policy(name, task="stiffness", scan=False):
+    """For the A1; the small last layer, which would hide differences, made large."""
+    torch.manual_seed(0)
+    policy = make_policy(name, A1, TASKS[task], scan)
+    for module in policy.modules():
+        if isinstance(module, Decoder):
+            torch.nn.init.normal_(module.weight, std=0.2)
+    return policy
+
+
+def rollout_of(policy, stage=0, n=8, precision="fp32"):
+    """A stage of the training (train.py) with one rollout in its buffer, and the generator."""
+    words = f"--envs {n} --epochs 2 --minibatches 2 --threads 1 --precision {precision} --out none"
+    args = train.parse_arguments([*words.split(), "--device", "cpu"])
+    stage = training_stages(policy, TASKS["stiffness"])[stage]
+    run = train.StageRun(0, stage, args, 0, policy, "cpu")
+    generator = torch.Generator().manual_seed(0)
+    collect(
+        run.env, run.actor, run.critic, run.buffer, run.observation, generator, run.learner.bf16
+    )
+    return run, generator
+
+
+def ratio(policy, batch, std, masks, bf16=False):
+    """PPO's, of a minibatch."""
+    with torch.no_grad():
+        mean = mean_action(policy, batch["observation"], masks, bf16)
+    log_prob = torch.distributions.Normal(mean, std).log_prob(batch["action"]).sum(-1)
+    return (log_prob - batch["log_prob"]).exp()
+
+
+def env_of(n, robot="a1", config=EnvConfig(), **options):
+    """An env of n robots, of one thread, just reset."""
+    env = LocomotionEnv(robot, n, num_threads=1, config=config, **options)
+    env.reset()
+    return env
+
+
+def env_with(*faults, robot="a1", config=QUIET, **options):
+    """An env of one robot a fault, just reset."""
+    options = {"num_threads": 1, "faults": [(1.0, fault) for fault in faults]} | options
+    env = LocomotionEnv(robot, len(faults), config=config, **options)
+    env.pin_faults(list(faults))
+    env.reset()
+    return env
+
+
+def rest(env, steps=1):
+    """Zero actions; what the env answers to the last of them."""
+    for _ in range(steps):
+        answer = env.step(np.zeros((env.num_envs, env.num_actions)))
+    return answer
+
+
+def flail(env, rng, steps=1):
+    """Random actions; what the env answers to the last of them."""
+    for _ in range(steps):
+        answer = env.step(rng.normal(size=(env.num_envs, env.num_actions)))
+    return answer
+
+
+def go_on_alike(one, two, rng, steps):
+    """Both envs, given the same random actions, answer alike to the bit."""
+    for _ in range(steps):
+        action = rng.normal(size=(one.num_envs, one.num_actions))
+        a, b = one.step(action), two.step(action)
+        assert all(np.array_equal(x, y) for x, y in zip((*a[0], *a[1:4]), (*b[0], *b[1:4])))
 
 
 @pytest.fixture(autouse=True)

@@ -3,74 +3,49 @@
 import math
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 import torch
 
 import checkpoint
-from baselines import METHODS, ROLL_DROP_RATE, ROAMLearner, make_policy, training_stages
-from conftest import save_policy
-from env import LocomotionEnv
+from baselines import METHODS, ROLL_DROP_RATE, ROAMLearner, training_stages
+from conftest import env_of, fresh_policy, ratio, rollout_of, save_policy
 from faults import TASKS
-from ppo import Critic, PPOConfig, RolloutBuffer, collect, proprioception, to_tensors
-from robots import A1
+from ppo import proprioception, to_tensors
 
 TASK = TASKS["stiffness"]
 
 
-def observe(policy, n=6, steps=3):
-    env = LocomotionEnv(A1, n, 0, 1, TASK.training, extras=policy.extras)
-    observation = env.reset()
-    for step in range(steps):
-        observation = env.step(torch.full((n, 12), 0.3 * step).numpy())[0]
+def observe(policy, n=6):
+    env = env_of(n, faults=TASK.training, extras=policy.extras)
+    for step in range(3):
+        observation, *_ = env.step(np.full((n, 12), 0.3 * step))
     return to_tensors(observation, "cpu")
-
-
-def fresh(name):
-    torch.manual_seed(0)
-    policy = make_policy(name, A1, TASK, False)
-    for module in policy.modules():  # the small last layer would hide differences
-        if isinstance(module, torch.nn.Linear) and module.out_features == 12:
-            torch.nn.init.normal_(module.weight, std=0.2)
-    return policy
-
-
-def run_stage(policy, stage, seed=0, config=PPOConfig(epochs=2, minibatches=2), n=8):
-    """One rollout and a learner for it."""
-    env = LocomotionEnv(A1, n, seed, 1, stage.faults, extras=(*{*stage.extras, "privileged"},))
-    observation, generator = env.reset(random_ages=True), torch.Generator().manual_seed(seed)
-    critic = Critic(observation) if stage.critic is None else stage.critic
-    policy.requires_grad_(False)
-    for module in stage.trained:
-        module.requires_grad_(True)
-    masks = stage.actor.sample_masks(n, generator) if stage.actor.replays_masks else {}
-    buffer = RolloutBuffer(24, observation, env.num_actions, masks, "cpu")
-    collect(env, stage.actor, critic, buffer, observation, generator)
-    return buffer, stage.learner(stage.actor, critic, config), generator
 
 
 @pytest.mark.parametrize("name", METHODS)
 @torch.no_grad()
 def test_every_policy_acts_and_survives_saving(name, tmp_path):
-    policy = fresh(name)
+    policy = fresh_policy(name)
     observation = observe(policy)
     action = policy(observation)
     assert action.shape == (6, 12) and policy.std().shape == (12,)
     halved = {key: x.half() for key, x in policy.state_dict().items()}  # as checkpoint.py ships it
-    for weights, tolerance in ((policy.state_dict(), 0.0), (halved, 2e-3)):
+    for weights, tolerance in ((policy.state_dict(), 0.0), (halved, 1e-2)):
         save_policy(tmp_path / "policy.pt", weights, policy=name)
         copy, _ = checkpoint.load_policy(tmp_path / "policy.pt", "a1")
         if tolerance == 0.0 or name != "roam":  # whose choice among behaviours is a draw
-            assert torch.allclose(copy(observation), action, rtol=0.0, atol=tolerance)
+            assert torch.allclose(copy(observation), action, rtol=tolerance, atol=tolerance)
 
 
 @pytest.mark.parametrize("name", METHODS)
 def test_each_stage_trains_its_weights_and_no_others(name):
-    policy, trained = fresh(name), set()
-    for stage in training_stages(policy, TASK):
+    policy, trained = fresh_policy(name), set()
+    for stage in range(len(training_stages(policy, TASK))):
         before = {key: value.clone() for key, value in policy.state_dict().items()}
-        buffer, learner, generator = run_stage(policy, stage)
+        run, generator = rollout_of(policy, stage)
         names = {key for key, p in policy.named_parameters() if p.requires_grad}
-        learner.update(buffer, generator)
+        run.learner.update(run.buffer, generator)
         after = policy.state_dict()
         moved = {key for key in after if not torch.equal(after[key], before[key])}
         assert moved == names
@@ -79,7 +54,7 @@ def test_each_stage_trains_its_weights_and_no_others(name):
 
 
 def test_a_mirrored_mlp_answers_a_mirrored_state_with_the_mirrored_action():
-    policy, observation = fresh("mirrored-mlp"), observe(fresh("mirrored-mlp"))
+    policy, observation = fresh_policy("mirrored-mlp"), observe(fresh_policy("mirrored-mlp"))
     image = observation._replace(legs=observation.legs[:, [1, 0, 3, 2]])  # in leg frames, all of it
     actions, mirrored = policy(observation).view(6, 4, 3), policy(image).view(6, 4, 3)
     assert torch.allclose(mirrored, actions[:, [1, 0, 3, 2]], atol=1e-5)
@@ -95,24 +70,17 @@ def test_proprioception_holds_every_number_once():
     assert seen.view(2, 10, 48)[1, 3].tolist() == own + body
 
 
-def ratio_before_any_update(policy, buffer):
-    batch = buffer.minibatch(torch.arange(len(buffer)))
-    with torch.no_grad():
-        mean = policy(batch["observation"], batch["masks"])
-        log_prob = torch.distributions.Normal(mean, buffer.std).log_prob(batch["action"]).sum(-1)
-    return (log_prob - batch["log_prob"]).exp()
-
-
 def test_roll_drops_ratio_is_off_where_a_neuron_was_dropped(monkeypatch):
     """At a rate of 1 % nearly every sample of 896 neurons is hit; at the paper's 0.01 %, one in
     twelve or so."""
     off = {}
     for rate in (1e-2, ROLL_DROP_RATE):
         monkeypatch.setattr("baselines.ROLL_DROP_RATE", rate)
-        policy = fresh("roll-drop")
-        buffer, *_ = run_stage(policy, training_stages(policy, TASK)[0], n=32)
+        policy = fresh_policy("roll-drop")
+        buffer = rollout_of(policy, n=32)[0].buffer
         assert not buffer.masks
-        far = (ratio_before_any_update(policy, buffer) - 1).abs() > 1e-3
+        batch = buffer.minibatch(torch.arange(len(buffer)))
+        far = (ratio(policy, batch, buffer.std, batch["masks"]) - 1).abs() > 1e-3
         off[rate] = far.float().mean().item()
     assert off[1e-2] > 0.95
     hit = 1 - (1 - ROLL_DROP_RATE) ** 896  # 0.086
@@ -120,25 +88,13 @@ def test_roll_drops_ratio_is_off_where_a_neuron_was_dropped(monkeypatch):
 
 
 def test_rma_reads_nothing_privileged_at_test():
-    policy = fresh("rma")
+    policy = fresh_policy("rma")
     observation = observe(policy)
     assert observation.privileged.numel() == 0  # the env does not even give it
     poisoned = observation._replace(privileged=torch.full((6, 25), math.nan))
     assert torch.equal(policy(observation), policy(poisoned))
     told = observation._replace(past=torch.zeros(6, 0), privileged=torch.full((6, 25), math.nan))
     assert policy(told).isnan().all()  # in training it does
-
-
-def test_rma_and_roam_are_told_what_is_wrong():
-    env = LocomotionEnv(A1, 2, 0, 1, TASK.training, extras=("privileged", "situation"))
-    env.pin_faults([fault for _, fault in TASK.training])
-    observation = env.reset()
-    assert observation.situation.tolist() == [[0.0], [1.0]]
-    well, limping = observation.privileged
-    assert well[:12].sum() == 0 and well[12:24].tolist() == [1] * 12
-    assert limping[:12].tolist() == [0, 0, 1, *[0] * 9]
-    assert limping[12:24].tolist() == [1, 1, 0, *[1] * 9]
-    assert (well[24], limping[24]) == tuple(env._friction[:, 1, 0].astype("float32"))
 
 
 def test_roams_loss_by_hand():
@@ -160,7 +116,7 @@ def test_roams_loss_by_hand():
 
 
 def test_roam_acts_in_training_by_its_situation_and_at_test_by_its_values():
-    policy = fresh("roam")
+    policy = fresh_policy("roam")
     observation = observe(policy)
     each = torch.stack([behaviour(observation) for behaviour in policy.behaviours])
     for index in (0, 1):
@@ -172,6 +128,6 @@ def test_roam_acts_in_training_by_its_situation_and_at_test_by_its_values():
 
 def test_every_policy_that_acts_has_the_whole_budget():
     """What chooses among policies, or guesses, comes on top."""
-    names = "rolt", "mlp", "rma", "roam"
-    shares = [[stage.share for stage in training_stages(fresh(name), TASK)] for name in names]
-    assert shares == [[1.0], [1.0], [1.0, 0.2], [1.0, 1.0, 0.2]]
+    budgets = {"rolt": [1.0], "mlp": [1.0], "rma": [1.0, 0.2], "roam": [1.0, 1.0, 0.2]}
+    for name, shares in budgets.items():
+        assert [stage.share for stage in training_stages(fresh_policy(name), TASK)] == shares

@@ -6,21 +6,24 @@ import numpy as np
 import pytest
 
 import rewards
+from conftest import QUIET, env_of, flail, go_on_alike, rest
 from env import CONTROL_DT, EnvConfig, LocomotionEnv
 from faults import TASKS
 from robots import A1
 
-# No chance but the command: what a test puts there stays.
-QUIET = EnvConfig(start_speed=0.0, push_speed=0.0, start_pose=(1.0, 1.0))
+ON_ITS_BACK = [0, 1, 0, 0]  # a quaternion
 
 
-def rollout(threads=1, seed=0, steps=60):
-    env = LocomotionEnv("a1", 8, seed, threads, TASKS["stiffness"].training)
+def rollout(threads=1, seed=0):
+    """Of robots on which locks come and go."""
+    env = LocomotionEnv("a1", 8, seed, threads, TASKS["mid-stride"].training)
     env.reset(random_ages=True)
     rng, trace = np.random.default_rng(1), []
-    for _ in range(steps):
-        observation, reward, terminated, truncated, info = env.step(rng.normal(size=(8, 12)))
-        trace += [*observation, reward, terminated, truncated, info["position"]]
+    for _ in range(60):
+        *answer, info = flail(env, rng)
+        locked = env.world.bind("eq_active").copy()
+        trace += [*answer[0], *answer[1:], info["position"], locked]
+    assert 0 < locked.sum() < 8
     return trace
 
 
@@ -32,9 +35,8 @@ def test_bit_identical_for_a_seed_at_any_number_of_threads():
 
 def test_wrong_use_is_refused():
     with pytest.raises(ValueError, match="unknown extras memory; there is privileged"):
-        LocomotionEnv("a1", 1, extras=("memory",))
-    env = LocomotionEnv("a1", 4, num_threads=1)
-    env.reset()
+        env_of(1, extras=("memory",))
+    env = env_of(4)
     for shape in ((12, 4), (48,), (4, 3, 4)):
         with pytest.raises(ValueError, match=r"actions are \(4, 12\), not"):
             env.step(np.zeros(shape))
@@ -43,42 +45,28 @@ def test_wrong_use_is_refused():
         env.step(np.full((4, 12), np.nan))
 
 
-BOX_AND_SKATES = (0.5, "tow:RR"), (0.5, "skate:FR+half-lock:RL_calf:-1.6")
-
-
-@pytest.mark.parametrize(
-    "robot, faults, terrain",
-    [
-        ("a1", TASKS["stiffness"].training, None),
-        ("a1", TASKS["terrain"].training, TASKS["terrain"].terrain),
-        ("go1", BOX_AND_SKATES, None),
-    ],
-)
+@pytest.mark.parametrize("robot, faults, terrain", [
+    ("a1", TASKS["stiffness"].training, None),
+    ("a1", TASKS["terrain"].training, TASKS["terrain"].terrain),
+    ("go1", ((0.5, "tow:RR"), (0.5, "skate:FR+half-lock:RL_calf:-1.6")), None),
+])  # fmt: skip
 def test_goes_on_to_the_bit_after_a_break(robot, faults, terrain):
-    def make():
-        config = EnvConfig(episode_seconds=0.5)
-        return LocomotionEnv(robot, 6, 2, 1, faults, config, terrain=terrain)
-
-    env, rng = make(), np.random.default_rng(0)
+    how = robot, 6, 2, 1, faults, EnvConfig(episode_seconds=0.5), (), terrain
+    env, twin = LocomotionEnv(*how), LocomotionEnv(*how)
     env.reset(random_ages=True)
-    actions = rng.normal(size=(40, 6, 12))
-    for action in actions[:20]:
-        env.step(action)
-    twin = make()
+    rng = np.random.default_rng(0)
+    flail(env, rng, 20)
     twin.load_state_dict(env.state_dict())
-    for field, other in zip(env.observe(), twin.observe()):
-        assert np.array_equal(field, other)
-    for action in actions[20:]:  # resets included: an episode has 25 steps
-        a, b = env.step(action), twin.step(action)
-        assert all(np.array_equal(x, y) for x, y in zip((*a[0], *a[1:4]), (*b[0], *b[1:4])))
+    assert all(np.array_equal(x, y) for x, y in zip(env.observe(), twin.observe()))
+    go_on_alike(env, twin, rng, 20)  # resets included: an episode has 25 steps
 
 
 def test_history_rolls_oldest_first_and_starts_filled():
-    env = LocomotionEnv("a1", 3, num_threads=1, extras=("past",))
-    first = env.reset().legs
-    assert first.shape == (3, 4, 10, 21)
-    assert np.array_equal(first, np.repeat(first[:, :, :1], 10, axis=2))
-    rng, before = np.random.default_rng(0), first
+    env = env_of(3, extras=("past",))
+    before = env.observe().legs
+    assert before.shape == (3, 4, 10, 21)
+    assert np.array_equal(before, np.repeat(before[:, :, :1], 10, axis=2))
+    rng = np.random.default_rng(0)
     mirrored = np.array([[1, 1, 1], [-1, 1, 1]] * 2)  # hips of left legs
     for _ in range(60):
         action = rng.normal(size=(3, 12))
@@ -97,26 +85,27 @@ def test_history_rolls_oldest_first_and_starts_filled():
     assert np.array_equal(after.legs, after.past[:, :, -10:])
 
 
-@pytest.mark.parametrize(
-    "degrees, height, falls", [(50, 2.0, False), (70, 2.0, True), (0, 0.05, True)]
-)
-def test_a_trunk_tilted_by_60_degrees_or_on_the_ground_has_fallen(degrees, height, falls):
-    env = LocomotionEnv("a1", 1, num_threads=1)
-    env.reset()
+def test_a_trunk_tilted_by_60_degrees_or_on_the_ground_has_fallen_and_the_others_go_on():
+    env = env_of(3)
+    degrees, height = np.array([50, 70, 0]), [2.0, 2.0, 0.05]
     half = np.radians(degrees) / 2
-    env.world.bind("qpos")[0, :7] = 0, 0, height, np.cos(half), np.sin(half), 0, 0
-    env._qpos[0, 7:] = np.tile([0.0, 2.8, -2.6], 4)  # legs folded beside the trunk
-    env.world.bind("qvel")[0] = 0
-    _, _, terminated, _, _ = env.step(np.zeros((1, 12)))
-    assert terminated[0] == falls
+    env._qpos[:, :7] = 0
+    env._qpos[:, 2:5] = np.stack([height, np.cos(half), np.sin(half)], axis=1)
+    env._qpos[:, 7:] = np.tile([0.0, 2.8, -2.6], 4)  # legs folded beside the trunk
+    env._qvel[:] = 0
+    _, reward, terminated, truncated, info = rest(env)
+    assert terminated.tolist() == [False, True, True] and not truncated.any()
+    assert reward[1] == pytest.approx(rewards.FALL, abs=0.05)  # a fall costs, once
+    assert reward[0] >= 0
+    assert env.age.tolist() == [1, 0, 0] and len(info["episode_returns"]) == 2
+    assert env.gravity[1, 2] == pytest.approx(-1)  # upright again
 
 
 def test_body_velocities_and_gravity_are_in_the_trunks_frame():
     """Yawed 90 degrees left and driven along world x, the robot moves to its right. Pitched nose
     down by 0.3 rad, gravity points forward."""
-    env = LocomotionEnv("a1", 1, num_threads=1)
-    env.reset()
-    env._qpos[0, 3:7] = [np.sqrt(0.5), 0, 0, np.sqrt(0.5)]
+    env = env_of(2)
+    env._qpos[:, 3:7] = [[0.5**0.5, 0, 0, 0.5**0.5], [np.cos(0.15), 0, np.sin(0.15), 0]]
     env._qvel[0, :6] = [1, 0, 0, 0, 0, 0.7]
     env.world.forward()
     env._read_state()
@@ -124,15 +113,11 @@ def test_body_velocities_and_gravity_are_in_the_trunks_frame():
     assert env.linear_velocity[0] == pytest.approx([0, -1, 0])
     assert env.angular_velocity[0] == pytest.approx([0, 0, 0.7])
     assert env.gravity[0] == pytest.approx([0, 0, -1])
-    env._qpos[0, 3:7] = [np.cos(0.15), 0, np.sin(0.15), 0]
-    env.world.forward()
-    env._read_state()
-    assert env.gravity[0] == pytest.approx([np.sin(0.3), 0, -np.cos(0.3)])
+    assert env.gravity[1] == pytest.approx([np.sin(0.3), 0, -np.cos(0.3)])
 
 
 def test_steering_follows_the_heading():
-    env = LocomotionEnv("a1", 4, num_threads=1)
-    env.reset()
+    env = env_of(4)
     env.yaw, env.heading = np.array([0.0, 0.0, 3.0, 0.0]), np.array([0.5, -3.0, -3.0, np.pi])
     env._steer()
     # half the error; at most 1 rad/s; the short way round: from 3.0 on to 2 pi - 3.0
@@ -141,32 +126,27 @@ def test_steering_follows_the_heading():
 
 
 def test_a_command_lasts_through_falls_and_changes_between_episodes_only():
-    config = EnvConfig(episode_seconds=0.2, command_seconds=0.1, start_speed=0.0)
-    env = LocomotionEnv("a1", 2, num_threads=1, config=config)
-    env.reset()
+    env = env_of(2, config=EnvConfig(episode_seconds=0.2, command_seconds=0.1, start_speed=0.0))
     first = env.command[:, 0].copy()
-    for _ in range(3):
-        env.step(np.zeros((2, 12)))
-    env._qpos[0, 3:7] = [0, 1, 0, 0]  # robot 0 falls before its command is old: it tries again
-    assert env.step(np.zeros((2, 12)))[2][0]
+    rest(env, 3)
+    env._qpos[0, 3:7] = ON_ITS_BACK  # robot 0 falls before its command is old: it tries again
+    assert rest(env)[2][0]
     assert np.array_equal(env.command[:, 0], first)
     for _ in range(5):
-        env.step(np.zeros((2, 12)))
+        rest(env)
         assert np.array_equal(env.command[:, 0], first)  # old by now, but not within an episode
-    env.step(np.zeros((2, 12)))  # robot 1's time is up
+    rest(env)  # robot 1's time is up
     assert env.command[0, 0] == first[0] and env.command[1, 0] != first[1]
-    env._qpos[0, 3:7] = [0, 1, 0, 0]  # robot 0 falls with an old command
-    env.step(np.zeros((2, 12)))
+    env._qpos[0, 3:7] = ON_ITS_BACK  # with an old command
+    rest(env)
     assert env.command[0, 0] != first[0]
 
 
 def test_timeout_gives_the_true_last_observation_and_restarts():
-    config = EnvConfig(episode_seconds=5 * CONTROL_DT, start_speed=0.0)
-    env = LocomotionEnv("a1", 2, num_threads=1, config=config)
-    env.reset()
+    env = env_of(2, config=EnvConfig(episode_seconds=5 * CONTROL_DT, start_speed=0.0))
     for step in range(5):
         before = env.observe().legs
-        observation, _, terminated, truncated, info = env.step(np.zeros((2, 12)))
+        observation, _, terminated, truncated, info = rest(env)
         assert truncated.all() == (step == 4) and not terminated.any()
     assert info["truncated_ids"].tolist() == [0, 1]
     final, legs = info["final_observation"].legs, observation.legs
@@ -180,11 +160,10 @@ REACH = 0.2 * np.cos(0.8) + 0.2 * np.cos(0.7) + 0.02  # m: thigh, calf, foot; a 
 
 def test_air_time_of_a_fall_from_one_metre():
     """sqrt(2 m / g) = 0.452 s: all four feet touch down at once, in the 23rd step (0.46 s)."""
-    env = LocomotionEnv("a1", 1, num_threads=1, config=QUIET)
-    env.reset()
-    env._qpos[0, 2], env.command[0, 0] = 1.0 + REACH, 0.5
+    env = env_of(1, config=QUIET)
+    env._qpos[0, 2] = 1.0 + REACH
     for step in range(1, 25):
-        *_, info = env.step(np.zeros((1, 12)))
+        *_, info = rest(env)
         assert env.touchdown.all() == env.touchdown.any() == (step == 23)
         assert env.foot_contact.all() == env.foot_contact.any() == (step >= 23)
         earned = 4 * (0.46 - 0.5) if step == 23 else 0.0
@@ -194,8 +173,7 @@ def test_air_time_of_a_fall_from_one_metre():
 def test_a_knee_on_the_ground_is_one_collision():
     """The trunk one thigh above the ground: the front right calf lies on it, the other legs are
     folded up."""
-    env = LocomotionEnv("a1", 1, num_threads=1, config=QUIET)
-    env.reset()
+    env = env_of(1, config=QUIET)
     angles = np.tile([0.0, 2.6, -2.69], (4, 1))
     angles[0] = 0.0, 0.0, -np.pi / 2
     env._qpos[0, 2], env._qpos[0, 7:] = 0.2, angles.ravel()
@@ -205,12 +183,12 @@ def test_a_knee_on_the_ground_is_one_collision():
 
 
 def test_a_push_redraws_the_horizontal_velocity_when_it_is_due():
-    configs = [EnvConfig(push_seconds=0.1, push_speed=speed) for speed in (1.0, 0.0)]
-    pushed, calm = (LocomotionEnv("a1", 64, num_threads=1, config=config) for config in configs)
-    pushed.reset(), calm.reset()
-    for step in range(1, 6):
+    pushed, calm = (
+        env_of(64, config=EnvConfig(push_seconds=0.1, push_speed=speed)) for speed in (1.0, 0.0)
+    )
+    for _ in range(5):
         assert np.array_equal(pushed._qvel, calm._qvel)  # until now, the same
-        pushed.step(np.zeros((64, 12))), calm.step(np.zeros((64, 12)))
+        rest(pushed), rest(calm)
     assert np.array_equal(pushed._qvel[:, 2:], calm._qvel[:, 2:])
     velocity = pushed._qvel[:, :2]
     assert np.abs(velocity).max() <= 1 and np.abs(velocity.mean()) < 0.2
@@ -218,8 +196,7 @@ def test_a_push_redraws_the_horizontal_velocity_when_it_is_due():
 
 
 def test_friction_is_drawn_at_every_reset_one_number_a_robot():
-    env = LocomotionEnv("a1", 256, num_threads=1)
-    env.reset()
+    env = env_of(256)
     first = env._friction[:, 1:, 0].copy()  # but for the ground
     assert (first == first[:, :1]).all()  # all parts of a robot
     assert 0.5 <= first.min() < 0.52 and 1.23 < first.max() <= 1.25
@@ -231,28 +208,12 @@ def test_friction_is_drawn_at_every_reset_one_number_a_robot():
 
 def test_friction_slows_a_sliding_robot():
     """Standing on all fours and slung sideways at 2 m/s, it loses mu * g * t."""
-    env = LocomotionEnv("a1", 2, num_threads=1, config=QUIET)
-    env.reset()
-    friction = np.array([0.1, 0.3])
+    env, friction = env_of(2, config=QUIET), np.array([0.1, 0.3])
     env._friction[:, :, 0] = friction[:, None]
-    for _ in range(40):
-        env.step(np.zeros((2, 12)))  # stand
+    rest(env, 40)
     env._qvel[:, 1] = 2.0
-    for _ in range(3):
-        env.step(np.zeros((2, 12)))
+    rest(env, 3)
     assert 2.0 - env._qvel[:, 1] == pytest.approx(friction * 9.81 * 3 * CONTROL_DT, rel=0.15)
-
-
-def test_a_robot_on_its_back_has_fallen_and_the_others_go_on():
-    env = LocomotionEnv("a1", 3, num_threads=1)
-    env.reset()
-    env._qpos[1, 3:7] = [0, 1, 0, 0]
-    _, reward, terminated, truncated, info = env.step(np.zeros((3, 12)))
-    assert terminated.tolist() == [False, True, False] and not truncated.any()
-    assert reward[1] == pytest.approx(rewards.FALL, abs=0.05)  # a fall costs, once
-    assert (reward[[0, 2]] >= 0).all()
-    assert env.age.tolist() == [1, 0, 1] and len(info["episode_returns"]) == 1
-    assert env.gravity[1, 2] == pytest.approx(-1)  # upright again
 
 
 @pytest.mark.parametrize(
@@ -264,8 +225,7 @@ def test_diverged_simulation_is_ended_counted_and_harms_nobody(
     """Also of a state that runs away in the last substep: MuJoCo would warn in the next step, when
     the numbers are in the buffer, or never."""
     monkeypatch.chdir(tmp_path)
-    env, twin = (LocomotionEnv("a1", 3, num_threads=1, config=QUIET) for _ in range(2))
-    env.reset(), twin.reset()
+    env, twin = env_of(3, config=QUIET), env_of(3, config=QUIET)
     step = env.world.step
 
     def run_away(**how):
@@ -276,16 +236,16 @@ def test_diverged_simulation_is_ended_counted_and_harms_nobody(
             env._qvel[1, 7] = value
 
     monkeypatch.setattr(env.world, "step", run_away)
-    observation, reward, terminated, _, info = env.step(np.zeros((3, 12)))
+    observation, reward, terminated, _, info = rest(env)
     monkeypatch.undo()
-    expected, *_ = twin.step(np.zeros((3, 12)))
+    expected, *_ = rest(twin)
     assert info["diverged"].tolist() == [False, True, False] == terminated.tolist()
     fields = *observation, *info["final_observation"], *info["rewards"].values()
     for x in (*fields, reward, info["speed"], info["position"]):
         assert (np.abs(x) < 1000).all()
     assert reward[1] == 0 and info["episode_returns"].tolist() == [0]
     assert np.array_equal(observation.legs[[0, 2]], expected.legs[[0, 2]])
-    _, _, terminated, _, info = env.step(np.zeros((3, 12)))
+    _, _, terminated, _, info = rest(env)
     assert not info["diverged"].any() and not terminated.any()
     assert not list(tmp_path.iterdir()) and capfd.readouterr().err == ""  # MuJoCo says nothing
 
@@ -305,29 +265,19 @@ BY_HAND = SimpleNamespace(
 )
 
 
-@pytest.mark.parametrize(
-    "term, value, weight",
-    [
-        (rewards.xy_velocity_tracking, np.exp(-1), 1.5),
-        (rewards.yaw_velocity_tracking, np.exp(-1), 0.5),
-        (rewards.z_velocity, 0.09, -2.0),
-        (rewards.roll_pitch_velocity, 0.05, -0.05),
-        (rewards.collision, 3, -1.0),
-        (rewards.joint_torques, 48, -2e-4),
-        (rewards.action_rate, 0.12, -0.01),
-        (rewards.foot_air_time, 0.1, 1.0),
-        (rewards.joint_error, 0.12, -0.04),
-    ],
-)
-def test_reward_term_by_hand(term, value, weight):
-    assert term(BY_HAND)[0] == pytest.approx(value)
-    assert rewards.REWARDS[term] == weight
-
-
-def test_reward_is_scaled_by_time_and_floored_and_standing_earns_no_air_time():
+def test_reward_terms_by_hand_scaled_by_time_and_floored_and_standing_earns_no_air_time():
     bad, terms = rewards.total_reward(BY_HAND, 0.02)
-    total = 2 * np.exp(-1) - 0.18 - 0.0025 - 3 - 0.0096 - 0.0012 + 0.1 - 0.0048
-    assert sum(t[0] for t in terms.values()) == pytest.approx(total)
+    assert {name: term[0] for name, term in terms.items()} == pytest.approx({
+        "xy_velocity_tracking": 1.5 * np.exp(-1),
+        "yaw_velocity_tracking": 0.5 * np.exp(-1),
+        "z_velocity": -2.0 * 0.09,
+        "roll_pitch_velocity": -0.05 * 0.05,
+        "collision": -1.0 * 3,
+        "joint_torques": -2e-4 * 48,
+        "action_rate": -0.01 * 0.12,
+        "foot_air_time": 1.0 * 0.1,
+        "joint_error": -0.04 * 0.12,
+    })  # fmt: skip
     assert bad[0] == 0.0
     good = SimpleNamespace(**(vars(BY_HAND) | {"link_contact": np.zeros((1, 8), bool)}))
     reward, terms = rewards.total_reward(good, 0.02)

@@ -1,17 +1,17 @@
-"""A policy that was taken away answers as it did, and walks without this repository."""
+"""A policy that was taken away answers as it did and walks without this repository; the env as
+other libraries want it."""
 
 import json
 import subprocess
 import sys
-from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
 import export
-from conftest import save_policy
-
-ROOT = Path(__file__).resolve().parent.parent
+from conftest import ROOT, save_policy
+from env import EnvConfig
 
 
 def test_the_shipped_policy_walks_on_plain_mujoco(tmp_path, capsys):
@@ -37,6 +37,24 @@ def test_policies_with_a_scan_or_a_long_memory_can_go_too(tmp_path):
         assert program(*inputs).shape == (7, 12)
 
 
-def test_what_draws_lots_stays(tmp_path):
-    with pytest.raises(SystemExit, match="error: ROAM draws its behaviour"):
-        export.main([save_policy(tmp_path / "p.pt", policy="roam"), str(tmp_path)])
+def test_the_vector_env_keeps_gymnasiums_contract():
+    checker = pytest.importorskip("gymnasium.utils.env_checker")
+    from vector_env import WalkingRobots
+
+    envs = WalkingRobots("a1", 4, num_threads=1, config=EnvConfig(episode_seconds=0.2))
+    checker.check_reset_seed_determinism(envs)
+    checker.check_reset_return_type(envs)
+    zeros, tries = np.zeros((4, 12), dtype=np.float32), []
+    for _ in range(2):
+        envs.reset(seed=1)
+        tries.append(envs.step(zeros))
+    assert checker.data_equivalence(tries[0], tries[1])
+    observation, _ = envs.reset(seed=0)
+    assert observation in envs.observation_space and set(observation) == {"legs", "action"}
+    for step in range(1, 11):
+        observation, reward, terminated, truncated, info = envs.step(zeros)
+        assert observation in envs.observation_space and reward.shape == (4,)
+        assert truncated.all() == (step == 10) and ("final_obs" in info) == (step == 10)
+    last = info["final_obs"][2]
+    assert last in envs.single_observation_space
+    assert not np.array_equal(last["legs"], observation["legs"][2])  # the next episode's

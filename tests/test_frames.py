@@ -4,7 +4,8 @@ exchanged; and to act so moves it as the mirror image moves."""
 import numpy as np
 import pytest
 
-from env import EnvConfig, LocomotionEnv
+from conftest import QUIET, env_of
+from env import EnvConfig
 from robots import ROBOTS
 
 
@@ -38,8 +39,7 @@ def put_into_mirrored_states(env) -> None:
 @pytest.mark.parametrize("leg_frames", [True, False])
 @pytest.mark.parametrize("name", ROBOTS)
 def test_a_mirrored_robot_says_the_same_in_leg_frames_alone(name, leg_frames):
-    env = LocomotionEnv(name, 2, num_threads=1, config=EnvConfig(leg_frames=leg_frames))
-    env.reset()
+    env = env_of(2, name, EnvConfig(leg_frames=leg_frames))
     put_into_mirrored_states(env)
     seen, image = env._frame()
     assert np.array_equal(image, seen[mirror_of(env.robot)[0]]) == leg_frames
@@ -48,9 +48,7 @@ def test_a_mirrored_robot_says_the_same_in_leg_frames_alone(name, leg_frames):
 
 @pytest.mark.parametrize("name", ROBOTS)
 def test_the_same_actions_move_mirrored_robots_as_mirror_images(name):
-    env = LocomotionEnv(name, 2, num_threads=1, config=EnvConfig(push_speed=0.0))
-    env.reset()
-    env._friction[:, :, 0] = 1.0
+    env = env_of(2, name, QUIET)
     swap, signs = mirror_of(env.robot)
     put_into_mirrored_states(env)
     env._qpos[:, 2] += 1.0  # in the air: contacts are solved to a tolerance only

@@ -2,18 +2,20 @@
 
 import copy
 import math
+from pathlib import Path
 
 import pytest
 import torch
+import torch.distributed as dist
+import torch.multiprocessing as mp
 
-from baselines import make_policy
-from env import EnvConfig, LocomotionEnv
+from conftest import env_of, fresh_policy, ratio, rollout_of
+from env import EnvConfig
 from faults import TASKS
 from ppo import (
-    Critic, Learner, PPOConfig, RolloutBuffer, adapt_learning_rate, collect, compute_gae,
-    mean_action, ppo_loss, to_tensors,
+    Critic, Learner, PPOConfig, RolloutBuffer, adapt_learning_rate, collect, compute_gae, ppo_loss,
+    to_tensors,
 )  # fmt: skip
-from robots import A1
 
 
 def column(*values):
@@ -63,27 +65,11 @@ def test_learning_rate_follows_the_kl():
     assert adapt_learning_rate(1e-2, 1e-4, 0.01) == 1e-2
 
 
-def rollout(policy_name="rolt", num_envs=8, bf16=False):
-    torch.manual_seed(0)
-    policy = make_policy(policy_name, A1, TASKS["stiffness"], False)
-    env = LocomotionEnv("a1", num_envs, 0, 1, TASKS["stiffness"].training, extras=("privileged",))
-    observation = env.reset(random_ages=True)
-    critic = Critic(observation)
-    torch.nn.init.normal_(policy.decoder.weight, std=0.2)  # so that dropout shows in the actions
-    generator = torch.Generator().manual_seed(0)
-    masks = policy.sample_masks(num_envs, generator)
-    buffer = RolloutBuffer(24, observation, env.num_actions, masks, "cpu")
-    collect(env, policy, critic, buffer, observation, generator, bf16)
-    return policy, critic, buffer, generator
+def rollout(n=8, precision="fp32"):
+    run, generator = rollout_of(fresh_policy("rolt"), n=n, precision=precision)
+    return run.actor, run.critic, run.buffer, generator
 
 
-def ratio(policy, batch, std, masks, bf16=False):
-    mean = mean_action(policy, batch["observation"], masks, bf16)
-    log_prob = torch.distributions.Normal(mean, std).log_prob(batch["action"]).sum(-1)
-    return (log_prob - batch["log_prob"]).exp()
-
-
-@torch.no_grad()
 def test_ratio_is_one_with_replayed_masks_and_not_with_fresh_ones():
     """The reason for consistent dropout, on a real rollout before any weight has moved."""
     policy, _, buffer, generator = rollout()
@@ -96,9 +82,8 @@ def test_ratio_is_one_with_replayed_masks_and_not_with_fresh_ones():
     assert (fresh - 1).abs().median() > 0.1
 
 
-@torch.no_grad()
 def test_ratio_is_one_in_bf16_too():
-    policy, _, buffer, generator = rollout(num_envs=64, bf16=True)
+    policy, _, buffer, generator = rollout(64, "bf16")
     batch = buffer.minibatch(torch.randperm(len(buffer), generator=generator)[:500])
     rounded, exact = (ratio(policy, batch, buffer.std, batch["masks"], x) for x in (True, False))
     assert (rounded - 1).abs().max() < 1e-2
@@ -109,11 +94,9 @@ def test_ratio_is_one_in_bf16_too():
 def test_the_critic_sees_what_policies_do_not():
     """Another friction, another fault: another value, the same actions. Noise on heights is the
     policy's alone."""
-    torch.manual_seed(0)
-    policy = make_policy("mlp", A1, TASKS["terrain"], True)
-    extras, terrain = ("privileged", "heights"), TASKS["terrain"].terrain
-    env = LocomotionEnv("a1", 4, 0, 1, extras=extras, terrain=terrain)
-    observation, generator = env.reset(), torch.Generator().manual_seed(0)
+    policy, generator = fresh_policy("mlp", "terrain", True), torch.Generator().manual_seed(0)
+    env = env_of(4, extras=("privileged", "heights"), terrain=TASKS["terrain"].terrain)
+    observation = env.observe()
     critic, masks = Critic(observation), policy.sample_masks(4, generator)
     seen = to_tensors(observation, "cpu")
     told = seen._replace(privileged=seen.privileged + 1)
@@ -175,9 +158,9 @@ def test_update_is_ppo_as_one_would_write_it_down():
 def test_the_buffer_holds_what_the_env_answered():
     """A twin of the env is given the same actions. One of three robots begins on its back."""
     policy, critic, _, generator = rollout()
-    how = {"num_threads": 1, "config": EnvConfig(episode_seconds=0.1), "extras": ("privileged",)}
-    env, twin = (LocomotionEnv("a1", 3, **how) for _ in range(2))
-    observation, _ = env.reset(), twin.reset()
+    how = {"config": EnvConfig(episode_seconds=0.1), "extras": ("privileged",)}
+    env, twin = env_of(3, **how), env_of(3, **how)
+    observation = env.observe()
     for world in (env, twin):
         world._qpos[1, 2:7] = [0.5, 0, 1, 0, 0]
     buffer = RolloutBuffer(8, observation, 12, policy.sample_masks(3, generator), "cpu")
@@ -201,11 +184,52 @@ def test_the_buffer_holds_what_the_env_answered():
         assert torch.equal(last, critic(to_tensors(seen, "cpu"))) and last.abs().min() > 0
 
 
-def test_a_gradient_that_is_not_finite_stops_training_and_names_its_tensor():
+def test_a_gradient_that_is_not_finite_stops_training_before_it_reaches_a_weight():
     policy, critic, buffer, generator = rollout()
-    learner = Learner(policy, critic, PPOConfig())
     buffer.observation.legs[5] = float("nan")
     with pytest.raises(FloatingPointError, match="a gradient is not finite"):
-        learner.update(buffer, generator)
+        Learner(policy, critic, PPOConfig()).update(buffer, generator)
     state = policy.state_dict() | critic.state_dict()  # moved by good minibatches before, perhaps
     assert all(torch.isfinite(p).all() for p in state.values())
+
+
+def updated(world_size: int, rank: int = 0) -> dict:
+    """One update, with a single minibatch, on this rank's share of a rollout that was of another
+    policy: its means and probabilities are moved."""
+    torch.set_num_threads(1)
+    policy, critic, buffer, _ = rollout()
+    buffer.mean += 0.1
+    buffer.log_prob += torch.rand(buffer.log_prob.shape)
+    mine = slice(rank * 8 // world_size, (rank + 1) * 8 // world_size)
+    buffer.observation = type(buffer.observation)(*(x[:, mine] for x in buffer.observation))
+    buffer.masks = {name: mask[:, mine] for name, mask in buffer.masks.items()}
+    for name in "action mean log_prob reward value next_value terminated truncated".split():
+        setattr(buffer, name, getattr(buffer, name)[:, mine])
+
+    learner = Learner(policy, critic, PPOConfig(epochs=1, minibatches=1))
+    stats = learner.update(buffer, torch.Generator().manual_seed(rank))
+    gradient = torch.cat([p.grad.flatten() for p in learner.parameters])
+    result = {"gradient": gradient, "learning_rate": learner.optimizer.param_groups[0]["lr"]}
+    return result | {"stats": stats, "weights": policy.state_dict()}
+
+
+def rank_of_two(rank: int, folder: str) -> None:
+    dist.init_process_group("gloo", init_method=f"file://{folder}/sync", rank=rank, world_size=2)
+    result = updated(2, rank)
+    dist.destroy_process_group()
+    names = [path.read_text() for path in Path("/proc/self/task").glob("*/comm")]
+    assert not [name for name in names if "gloo" in name]  # a thread of it left may abort the exit
+    torch.save(result, f"{folder}/{rank}.pt")
+
+
+def test_two_ranks_of_half_the_robots_follow_one_rank_of_all(tmp_path):
+    mp.spawn(rank_of_two, (str(tmp_path),), nprocs=2)
+    first, second = (torch.load(tmp_path / f"{rank}.pt") for rank in (0, 1))
+    one = updated(1)
+    assert torch.equal(first["gradient"], second["gradient"]) and first["stats"] == second["stats"]
+    for name in one["weights"]:
+        assert torch.equal(first["weights"][name], second["weights"][name])
+    assert one["gradient"].norm() > 0.1
+    assert torch.allclose(first["gradient"], one["gradient"], atol=1e-5)
+    assert first["learning_rate"] == one["learning_rate"] != PPOConfig.learning_rate  # moved by KL
+    assert first["stats"] == pytest.approx(one["stats"], abs=1e-4)

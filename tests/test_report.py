@@ -1,13 +1,13 @@
 """Statistics and verdicts, against numbers worked out by hand."""
 
-import csv
-
 import numpy as np
 import pytest
 
 import report
+from walk import write_csv
 
 SEEN = {"FR": 1, "RR": 0, "RL": 0}
+WELL, SLOW = [[0.9, 0.9]] * 3, [[0.5, 0.5]] * 3  # three seeds, two episodes
 
 
 def table(**shares) -> list[dict]:
@@ -18,8 +18,8 @@ def table(**shares) -> list[dict]:
             for seed, episodes in enumerate(seeds):
                 row = {"method": method, "case": case, "seed": seed, "seen": SEEN[case]}
                 row |= {"leg_duty": 0.05 if (method, case) == ("mlp", "RL") else 0.5}
-                rows += [row | {"share": x, "fell": int(x == 0), "success": int(x >= 0.5)}
-                         for x in episodes]  # fmt: skip
+                for x in episodes:
+                    rows.append(row | {"share": x, "fell": int(x == 0), "success": int(x >= 0.5)})
     return rows
 
 
@@ -78,14 +78,10 @@ def test_a_verdict_takes_three_seeds_and_an_interval_off_zero():
 
 
 def test_the_claims_leave_out_who_is_untrained_and_legs_that_hang(tmp_path, capsys):
-    walks = [[0.9, 0.9]] * 3
-    rows = table(rolt={"FR": walks, "RR": walks, "RL": walks},
-                 mlp={"FR": walks, "RR": [[0.1, 0.1]] * 3, "RL": walks},
-                 rma={"FR": [[0.3, 0.3]] * 3, "RR": walks, "RL": walks})  # fmt: skip
-    with open(tmp_path / "stiffness.csv", "w", newline="") as file:
-        writer = csv.DictWriter(file, list(rows[0]))
-        writer.writeheader()
-        writer.writerows(rows)
+    rows = table(rolt={"FR": WELL, "RR": WELL, "RL": WELL},
+                 mlp={"FR": WELL, "RR": [[0.1, 0.1]] * 3, "RL": WELL},
+                 rma={"FR": SLOW, "RR": WELL, "RL": WELL})  # fmt: skip
+    write_csv(tmp_path / "stiffness.csv", rows)
     report.claims(tmp_path)
     lines = capsys.readouterr().out.splitlines()
     assert "| 1.00 (1.00 to 1.00) | 0.8 | +0.20 (+0.20 to +0.20) | 3 | shows | - |" in lines[2]
@@ -100,15 +96,13 @@ def test_noise_is_measured_by_what_is_kept():
 
 
 def test_a_comparison_leaves_out_who_is_untrained_and_gives_no_p_to_few_seeds(capsys):
-    walks, slow = [[0.9, 0.9]] * 3, [[0.5, 0.5]] * 3
-    rows = table(rolt={"FR": walks, "RR": walks, "RL": walks},
-                 mlp={"FR": walks, "RR": slow, "RL": slow},
-                 rma={"FR": slow, "RR": walks, "RL": walks})  # fmt: skip
+    rows = table(rolt={"FR": WELL, "RR": WELL, "RL": WELL},
+                 mlp={"FR": WELL, "RR": SLOW, "RL": SLOW},
+                 rma={"FR": SLOW, "RR": WELL, "RL": WELL})  # fmt: skip
     report.compare(rows, {"unseen": ["RR", "RL"]})
     head, _, rolt, mlp = capsys.readouterr().out.strip().splitlines()
     assert head.startswith("| unseen (RR) |")  # of RL the MLP's leg hangs
     assert rolt == "| rolt | 0.90 | | |" and mlp == "| mlp | 0.50 | 100% | - |"
-    five = [x * 2 for x in ([[0.9]] * 3, [[0.5]] * 3)]
-    rows = table(rolt={"FR": five[0], "RR": five[0]}, roam={"FR": five[0], "RR": five[1]})
+    rows = table(rolt={"FR": WELL * 2, "RR": WELL * 2}, roam={"FR": WELL * 2, "RR": SLOW * 2})
     report.compare(rows, {"unseen": ["RR"]})
     assert capsys.readouterr().out.strip().endswith("| roam | 0.50 | 100% | 0.002 |")  # 2 of 924

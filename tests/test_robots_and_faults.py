@@ -1,4 +1,4 @@
-"""The model against its data sheet, and faults on simulated robots."""
+"""The model against its data sheet, and faults on simulated robots: what they do, and to whom."""
 
 from dataclasses import replace
 
@@ -6,11 +6,10 @@ import mujoco
 import numpy as np
 import pytest
 
-from env import EnvConfig, LocomotionEnv
-from faults import HEALTHY, KINDS, TASKS, faulty_model, harms_of, other_harms
-from robots import A1, ROBOTS, build_model
-
-QUIET = EnvConfig(push_speed=0.0, start_speed=0.0, start_pose=(1.0, 1.0), friction=(1.0, 1.0))
+from conftest import QUIET, env_of, env_with, flail, rest
+from env import EnvConfig
+from faults import HEALTHY, REAL_WORLD, TASKS, faulty_model
+from robots import A1, BOX_FRICTION, BOX_MASS, GO1, ROBOTS, SLACK, TETHER, build_model
 
 
 @pytest.mark.parametrize("robot", ROBOTS.values(), ids=ROBOTS)
@@ -18,8 +17,6 @@ def test_model_agrees_with_the_data(robot):
     model = build_model(robot)
     joints = len(robot.legs) * len(robot.links)
     assert (model.nu, model.neq, model.nv) == (joints, joints, joints + 6)
-    total = robot.trunk_mass + len(robot.legs) * sum(link.mass for link in robot.links)
-    assert model.body_mass.sum() == pytest.approx(total)
     for i, name in enumerate(robot.joints):
         link = robot.links[i % len(robot.links)]
         assert model.actuator(i).name == model.equality(i).name == name
@@ -30,14 +27,11 @@ def test_model_agrees_with_the_data(robot):
         assert model.actuator(i).forcerange == pytest.approx([-link.effort, link.effort])
 
 
-@pytest.mark.parametrize(
-    "name, total, leg",
-    [
-        ("a1", 12.453, (0.696, 1.013, 0.226)),
-        ("go1", 12.743448, (0.68, 1.009, 0.195862)),
-        ("hexapod", 30.508951, (1.20924, 0.925235, 0.281487 + 0.0190129)),  # foot and calf are one
-    ],
-)
+@pytest.mark.parametrize("name, total, leg", [
+    ("a1", 12.453, (0.696, 1.013, 0.226)),
+    ("go1", 12.743448, (0.68, 1.009, 0.195862)),
+    ("hexapod", 30.508951, (1.20924, 0.925235, 0.281487 + 0.0190129)),  # foot and calf are one
+])  # fmt: skip
 def test_weighs_what_its_source_says(name, total, leg):
     """kg; Unitree's and the ElSpider Air's descriptions, of which a leg weighs 2.435."""
     model = build_model(ROBOTS[name])
@@ -54,11 +48,11 @@ def test_legs_are_mirror_images(robot):
     mujoco.mj_forward(data.model, data)
     at = dict(zip(robot.mounts, robot.legs))
     for (x, y, z), leg in at.items():
-        for link in robot.links:
-            place, twin = (data.body(f"{one}_{link.name}").xipos for one in (leg, at[x, -y, z]))
+        pair = leg, at[x, -y, z]
+        places = [[data.body(f"{one}_{link.name}").xipos for one in pair] for link in robot.links]
+        places.append([data.geom(f"{one}_foot").xpos for one in pair])
+        for place, twin in places:
             assert place == pytest.approx(twin * [1, -1, 1], abs=1e-6)
-        place, twin = (data.geom(f"{one}_foot").xpos for one in (leg, at[x, -y, z]))
-        assert place == pytest.approx(twin * [1, -1, 1], abs=1e-6)
 
 
 def test_a_robot_that_does_not_fit_together_is_refused():
@@ -71,39 +65,26 @@ def test_a_robot_that_does_not_fit_together_is_refused():
 
 @pytest.mark.parametrize("robot", ROBOTS)
 def test_stands_under_zero_action(robot):
-    env = LocomotionEnv(robot, 2, num_threads=1, config=QUIET)
-    env.reset()
+    env = env_of(2, robot, QUIET)
     for _ in range(150):
-        _, _, terminated, _, _ = env.step(np.zeros((2, env.num_actions)))
-        assert not terminated.any()
+        assert not rest(env)[2].any()
     assert env.foot_contact.all() and not env.link_contact.any()
     assert env.gravity[:, 2] == pytest.approx(-1, abs=0.01)
 
 
-def test_locked_joint_holds_under_load_and_is_free_after_reset():
-    """FR calf locked, 20 kg on its back and the policy flailing: it stays. Healthy, it moves."""
-    faults = ((1.0, "lock:FR_calf"),)
-    env = LocomotionEnv("a1", 1, num_threads=1, faults=faults, config=QUIET)
-    env.reset()
-    rng = np.random.default_rng(0)
+def test_locked_joint_holds_under_load():
+    """FR calf locked, 20 kg on its back and the policy flailing: it stays."""
+    env, rng = env_with("lock:FR_calf"), np.random.default_rng(0)
     trunk = env.model.body("trunk").id
     for _ in range(100):
         env.world.bind("xfrc_applied")[:, trunk, 2] = -20 * 9.81  # N; a reset clears it
-        env.step(rng.normal(size=(1, 12)))
+        flail(env, rng)
         assert abs(env.joint_error[0, 0, 2]) < 0.01
-    env.pin_faults([HEALTHY])
-    env.reset()
-    env.world.bind("xfrc_applied")[:] = 0
-    for _ in range(25):
-        env.step(np.full((1, 12), 0.8))
-    assert abs(env.joint_error[0, 0, 2]) > 0.1
 
 
 def test_weak_motor_gives_its_share_of_the_torque():
     """Same state, same target: half the strength is half the force, and half the clipping limit."""
-    env = LocomotionEnv("a1", 3, num_threads=1, config=QUIET)
-    env.pin_faults(["weaken:FL:0.5", HEALTHY, "disable:RL_thigh"])
-    env.reset()
+    env = env_with("weaken:FL:0.5", HEALTHY, "disable:RL_thigh")
     for action in (0.5, 10.0):  # 10: 2.5 rad away, 50 N m asked of 33.5
         env.world.bind("ctrl")[:] = (env._default + 0.25 * action).reshape(-1)
         env.world.forward(stage=mujoco.mjtStage.mjSTAGE_ACC)
@@ -115,19 +96,10 @@ def test_weak_motor_gives_its_share_of_the_torque():
 
 
 def test_training_faults_are_drawn_with_their_odds():
-    env = LocomotionEnv("a1", 400, seed=3, num_threads=1, faults=TASKS["stiffness"].training)
-    env.reset()
+    env = env_of(400, seed=3, faults=TASKS["stiffness"].training)
     locked = env.world.bind("eq_active")[:, 2] > 0
     assert 160 < locked.sum() < 240  # 200 +- 4 sd
     assert np.array_equal(env.world.bind("eq_active").sum(axis=1), locked)  # nothing else is locked
-
-
-def test_faults_are_read_from_words():
-    assert harms_of(HEALTHY) == () and harms_of("lock:FR_calf")[0][:3] == ("lock", "FR_calf", 0.0)
-    for kind, bounds in KINDS.items():
-        number = bounds and bounds[1] / 2
-        (harm,) = harms_of(f"{kind}:FR" + (f":{number}" if bounds else ""))
-        assert harm[:3] == (kind, "FR", number or 0)
 
 
 def test_faults_add_up():
@@ -139,23 +111,147 @@ def test_faults_add_up():
 
 
 def test_critics_are_told_of_every_harm():
-    """Locks, motors and friction read off the simulation, all else by its number."""
+    """Locks, motors and friction read off the simulation, else by number; ROAM of which it is."""
     faults = ["healthy", "lock:FR_calf", "weaken:FL:0.5", "half-lock:RR_calf:-1.5", "skate:FR"]
-    options = {"faults": [(0.2, fault) for fault in faults], "extras": ("privileged",)}
-    env = LocomotionEnv("a1", 5, num_threads=1, config=QUIET, **options)
-    env.pin_faults(faults)
-    told = env.reset().privileged
-    assert told.shape == (5, 2 * 12 + 1 + 2)
-    assert told[0].tolist() == [0] * 12 + [1] * 12 + [1] + [0, 0]
-    assert (told[1] != told[0]).nonzero()[0].tolist() == [2, 14]  # locked, and its motor off
-    assert told[2, 15:18].tolist() == [0.5] * 3 and told[3, -2:].tolist() == [-1.5, 0]
-    assert told[4, -2:].tolist() == [0, 1] and other_harms(faults[:3]) == []
+    env = env_with(*faults, config=EnvConfig(), extras=("privileged", "situation"))
+    observation = env.observe()
+    assert observation.situation.tolist() == [[0], [1], [2], [3], [4]]
+    locked, motors, friction, others = np.split(observation.privileged, [12, 24, 25], axis=1)
+    assert np.argwhere(locked).tolist() == [[1, 2]]
+    assert np.argwhere(motors != 1).tolist() == [[1, 2], [2, 3], [2, 4], [2, 5]]
+    assert motors[1, 2] == 0 and motors[2, 3:6].tolist() == [0.5] * 3
+    assert friction[:, 0].tolist() == env._friction[:, 1, 0].astype(np.float32).tolist()
+    assert others.tolist() == [[0, 0], [0, 0], [0, 0], [-1.5, 0], [0, 1]]
 
 
-@pytest.mark.parametrize("text", [
-    "", "lock", "lock:", "weaken:RL", "weaken:RL:x", "weaken:RL:2", "weaken:RL:nan", "melt:FR",
-    "tow", "half-lock:RR_calf", "half-lock:RR_calf:nan", "half-lock:RR_calf:x", "skate:FR:2",
+@pytest.mark.parametrize("text, says", [
+    *((text, "as in lock:FR_calf") for text in (
+        "", "lock", "weaken:RL", "weaken:RL:x", "weaken:RL:nan", "melt:FR", "tow",
+        "half-lock:RR_calf", "half-lock:RR_calf:nan", "half-lock:RR_calf:x", "skate:FR:2",
+        "lock:FR_calf@5", "lock:FR_calf@nan:", "lock:FR_calf@5:inf")),
+    ("weaken:RL:2", "from 0 to 1"), ("late:FR:-0.01", "from 0 to 0.04"),
+    ("late:FR:0.05", "from 0 to 0.04"), ("bias:FR:nan", "from -7 to 7"),
+    ("blow:trunk:inf", "from -100 to 100"), ("blow:trunk:5", "when is the blow"),
+    ("lock:FR_calf@12:5", "a later end"), ("lock:FR_calf@-1:5", "a later end"),
+    ("lock:FR_calf@2/1", "not shorter"), ("lock:", "no joint or leg"),
+    ("bias:XX:0.1", "no joint or leg"), ("half-lock:MR_calf:-1.5", "no joint or leg 'MR_calf'"),
+    ("lock:MR_calf", "no joint or leg 'MR_calf'; it has FR_hip, FR_thigh"),
+    ("tow:MR", "no leg MR"), ("payload:roof:1", "no roof"),
+    ("half-lock:RR_calf:0.5", "RR_calf turns from -2.818 to -0.888 rad: no stop at 0.5"),
 ])  # fmt: skip
-def test_unreadable_faults_are_refused(text):
-    with pytest.raises(ValueError, match="lock:FR_calf|no joint|no stop at nan"):
-        faulty_model(text, A1, build_model(A1))
+def test_faults_that_cannot_be_are_refused_at_once(text, says):
+    """Also if their time comes later."""
+    with pytest.raises(ValueError, match=says):
+        env_with(text, robot="go1")
+    if "@" not in text and says != "when is the blow":
+        with pytest.raises(ValueError, match=says):
+            env_with(text + "@5:", robot="go1")
+
+
+def test_a_box_that_was_not_built_is_refused():
+    env = env_with(HEALTHY)
+    env.pin_faults(["tow:RR"])
+    with pytest.raises(ValueError, match="no RR, box or wheel for tow:RR: make the env with this"):
+        env.reset()
+
+
+@pytest.mark.parametrize("tied", [True, False])
+def test_the_tether_pulls_and_never_pushes(tied):
+    """Without weight the tether alone moves the box: set 1 m off, at its length, at the foot."""
+    model = build_model(A1, towing=("RR",))
+    model.opt.gravity[:] = 0
+    tether = model.tendon("RR_tether").id
+    model.tendon_range[tether, 1] = TETHER if tied else SLACK
+    data, box = mujoco.MjData(model), model.joint("box")
+    slack = (0.78, 0.0, False), (0.3, -3.0, False), (0.01, -1.0, False)
+    for distance, speed, pulls in ((1.0, 0.0, True), *slack, (1.0, -0.2, True)):
+        mujoco.mj_resetDataKeyframe(model, data, 0)
+        data.qpos[2] += 1.0
+        mujoco.mj_kinematics(model, data)
+        front = data.site("RR_ankle").xpos - [distance, 0, 0]
+        data.qpos[box.qposadr[0] : box.qposadr[0] + 3] = front - model.site("box_front").pos
+        data.qvel[box.dofadr[0]] = -speed  # backwards, away from the robot, if speed > 0
+        mujoco.mj_forward(model, data)
+        assert data.ten_length[tether] == pytest.approx(distance, abs=1e-6)
+        force = data.efc_force[data.efc_type == mujoco.mjtConstraint.mjCNSTR_LIMIT_TENDON]
+        assert (force >= 0).all() and (force.sum() > 1) == (pulls and tied)
+        towards_robot, on_robot = data.qfrc_constraint[[box.dofadr[0], 0]]
+        assert towards_robot == pytest.approx(force.sum(), abs=1e-6)
+        assert on_robot == pytest.approx(-force.sum(), abs=1e-6)  # backwards
+
+
+def test_the_box_hangs_on_its_own_robot_alone():
+    """Both boxes are pulled by 10 N more than their friction; the second robot has none."""
+    env = env_with("tow:RR", HEALTHY, robot="go1", config=replace(QUIET, friction=(1.25, 1.25)))
+    box, geom = env.model.body("box").id, env.model.geom("box").id
+    assert env.world.expanded("geom_friction")[:, geom, 0] == pytest.approx(BOX_FRICTION)
+    assert env.model.body("box").mass == pytest.approx(BOX_MASS)
+    for _ in range(100):
+        env.world.bind("xfrc_applied")[:, box, 0] = -(BOX_FRICTION * BOX_MASS * 9.81 + 10)
+        assert not rest(env)[2].any()
+    tether = env.world.bind("ten_length")[:, 0]
+    assert tether[0] == pytest.approx(TETHER, abs=0.02) and tether[1] > TETHER + 1
+
+
+def test_a_half_lock_stops_one_side_only():
+    """Asked to open by 0.5 rad the calf stays at the string; it bends like a healthy one."""
+    for target, stopped in ((-1.0, True), (-2.0, False)):
+        env, action = env_with("half-lock:RR_calf:-1.5", HEALTHY, robot="go1"), np.zeros((2, 4, 3))
+        action[:, 2, 2] = (target + 1.5) / GO1.action_scale
+        for _ in range(40):
+            env._qpos[:, :7], env._qvel[:, :6] = [0, 0, 1, 1, 0, 0, 0], 0  # held in the air
+            env.step(action.reshape(2, 12))
+            assert env.joint_error[0, 2, 2] < 0.05  # a string gives when the leg swings into it
+        half_locked, free = env.joint_error[:, 2, 2]
+        assert free == pytest.approx(target + 1.5, abs=0.05)
+        expected = 0.0 if stopped else free
+        assert half_locked == pytest.approx(expected, abs=0.03)  # 1 degree at 10 N m
+
+
+def test_a_half_locked_leg_starts_on_the_right_side_of_its_string():
+    env = env_with(*["half-lock:RR_calf:-1.5"] * 50, robot="go1", config=EnvConfig())
+    assert (env.joint_error[:, 2, 2] <= 1e-9).all() and (env.joint_error[:, 3, 2] > 0.1).any()
+
+
+def test_a_skate_rolls_forward_grips_sideways_and_acts_on_its_foot_alone():
+    """Standing feet are pushed for half a second: only the skate moves, and only forward."""
+    for axis, rolls in ((0, True), (1, False)):
+        env = env_with("skate:FR", HEALTHY, robot="go1")
+        rest(env, 50)  # settle
+        names = [env.model.geom(f"{leg}_foot").id for leg in GO1.legs]
+        before = env.world.bind("geom_xpos")[:, names, axis].copy()
+        wheel = env.model.body("FR_wheel").id
+        for _ in range(25):
+            env.world.bind("xfrc_applied")[:, wheel, axis] = 12.0  # N, through the axle
+            rest(env)
+        moved = np.abs(env.world.bind("geom_xpos")[:, names, axis] - before)
+        assert (moved[0, 0] > 0.05) == rolls
+        assert (moved[1] < 0.02).all() and (moved[0, 1:] < 0.02).all() and moved[0, 0] < 0.3
+
+
+def test_reset_undoes_every_fault():
+    """Healthy again, a robot's model fields are the healthy model's, to the bit."""
+    stiff = "lock:FR_calf+disable:FL_thigh+weaken:RR:0.3"
+    faults = stiff, *(REAL_WORLD[name] for name in ("weaken", "box", "skates"))
+    env = env_with(*faults, robot="go1")
+    changed = {
+        "actuator_gainprm": [True, True, False, False],
+        "actuator_biasprm": [True, True, False, False],
+        "actuator_forcerange": [True, True, False, False],
+        "jnt_range": [False, True, False, False],
+        "tendon_range": [False, False, True, False],
+        "dof_frictionloss": [False, False, False, True],
+    }
+    healthy_one = {name: np.stack([getattr(env.model, name)] * 4) for name in changed}
+    for name, whose in changed.items():
+        differs = env.world.expanded(name) != healthy_one[name]
+        assert differs.reshape(4, -1).any(axis=1).tolist() == whose, name
+    assert env.world.bind("eq_active").any(axis=1).tolist() == [True, False, False, False]
+    flail(env, np.random.default_rng(0), 20)
+    env.pin_faults([HEALTHY] * 4)
+    env.reset()
+    assert not env.world.bind("eq_active").any()
+    for name, value in healthy_one.items():
+        assert np.array_equal(env.world.expanded(name), value)
+    box = np.stack([env.model.key_qpos[0, -7:]] * 4)
+    assert np.array_equal(env._qpos[:, -7:], box)  # it is back

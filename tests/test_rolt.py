@@ -8,39 +8,42 @@ from env import Observation
 from rolt import ROLT, ROLTConfig, drop
 
 
-def observation(n=5, legs=4, seed=0):
-    g = torch.Generator().manual_seed(seed)
-    shapes = (n, legs, 10, 21), (n, 3 * legs), (n, 0), (n, 16, 12), (n, 0), (n, 0)
+def observation(n=5):
+    g = torch.Generator().manual_seed(0)
+    shapes = (n, 4, 10, 21), (n, 12), (n, 0), (n, 16, 12), (n, 0), (n, 0)
     return Observation(*(torch.randn(*shape, generator=g) for shape in shapes))
 
 
-def model(seed=0, **switches):
-    torch.manual_seed(seed)
+def model(**switches):
+    torch.manual_seed(0)
     policy = ROLT(4, 3, replace(ROLTConfig(scan=True), **switches))
     torch.nn.init.normal_(policy.decoder.weight)  # the small initial one would hide differences
     return policy
 
 
-def masks_of(policy, n=5, seed=1):
-    return policy.sample_masks(n, torch.Generator().manual_seed(seed))
+def masks_of(policy, n=5):
+    return policy.sample_masks(n, torch.Generator().manual_seed(1))
+
+
+def by_leg(policy, obs):
+    return policy(obs).view(5, 4, 3)
 
 
 def test_permuting_the_legs_permutes_the_actions():
     """The legs share every weight; the action token is the same for all of them."""
-    policy, obs, order = model(), observation(), torch.tensor([2, 0, 3, 1])
-    actions = policy(obs).view(5, 4, 3)
-    permuted = policy(obs._replace(legs=obs.legs[:, order])).view(5, 4, 3)
-    assert torch.allclose(permuted, actions[:, order], atol=1e-5)
-    assert (actions[:, 0] - actions[:, 1]).abs().max() > 0.1  # but legs do act differently
+    obs, order = observation(), torch.tensor([2, 0, 3, 1])
+    permuted = obs._replace(legs=obs.legs[:, order])
+    for identity, share in (("action", True), ("none", True), ("embedding", False)):
+        policy = model(identity=identity)
+        actions = by_leg(policy, obs)
+        assert torch.allclose(by_leg(policy, permuted), actions[:, order], atol=1e-5) == share
+        assert (actions[:, 0] - actions[:, 1]).abs().max() > 0.1  # but legs do act differently
 
 
-def test_module_pe_tells_the_legs_apart():
-    policy, obs, order = model(identity="embedding"), observation(), torch.tensor([2, 0, 3, 1])
-    actions = policy(obs).view(5, 4, 3)
-    permuted = policy(obs._replace(legs=obs.legs[:, order])).view(5, 4, 3)
-    assert (permuted - actions[:, order]).abs().max() > 1e-3
-    same = obs._replace(legs=obs.legs[:, :1].expand(-1, 4, -1, -1))  # legs that see the same
-    named, nameless = policy(same).view(5, 4, 3), model()(same).view(5, 4, 3)
+def test_module_pe_tells_apart_legs_that_see_the_same():
+    obs = observation()
+    same = obs._replace(legs=obs.legs[:, :1].expand(-1, 4, -1, -1))
+    named, nameless = by_leg(model(identity="embedding"), same), by_leg(model(), same)
     assert (named[:, 0] - named[:, 1]).abs().max() > 1e-3
     assert torch.allclose(nameless[:, 0], nameless[:, 1], atol=1e-5)
 
@@ -49,8 +52,8 @@ def test_only_rolt_reads_the_action_token():
     obs = observation()
     other = obs._replace(action=obs.action + 1)
     assert not torch.allclose(model()(obs), model()(other))
-    for identity in ("embedding", "none"):
-        assert torch.equal(model(identity=identity)(obs), model(identity=identity)(other))
+    for policy in (model(identity="embedding"), model(identity="none")):
+        assert torch.equal(policy(obs), policy(other))
 
 
 def test_pruned_last_layer_equals_the_full_one():
@@ -91,9 +94,8 @@ def test_masks_change_the_action_and_repeat_it():
     assert torch.equal(policy(obs, masks), policy(obs, masks))
     for name, mask in masks.items():  # each of them counts
         assert not torch.allclose(policy(obs, masks), policy(obs, masks | {name: ~mask})), name
-    everything = {name: torch.ones_like(mask) for name, mask in masks.items()}
+    kept = {"patch_position": torch.ones(5, 12, dtype=torch.bool)}
     plain = model(feature_dropout=0.0)  # the same weights
-    kept = {"patch_position": everything["patch_position"]}
     assert torch.allclose(plain(obs, kept), policy(obs), atol=1e-5)
 
 

@@ -1,6 +1,5 @@
 """The scripts as a user runs them: train, resume, evaluate; and what they say to wrong input."""
 
-import csv
 import re
 import signal
 import subprocess
@@ -13,22 +12,17 @@ import torch
 
 import checkpoint
 import evaluate
+import export
 import train
 import watch
 from baselines import make_policy
-from conftest import save_policy
-from env import LocomotionEnv
-from faults import TASKS
+from conftest import ROOT, env_of, save_policy
+from faults import STIFF, TASKS
 from ppo import Critic
 from robots import A1
+from walk import read_csv
 
-ROOT = Path(__file__).resolve().parent.parent
 SMALL = ["--envs", "8", "--minibatches", "2", "--epochs", "1"]  # an iteration has 192 steps
-
-
-def rows(path):
-    with open(path, newline="") as file:
-        return list(csv.DictReader(file))
 
 
 def tensors(value, name=""):
@@ -52,7 +46,7 @@ def same_run(one, other):
             assert x == runs[1][name], name
     no_time, tables = {"collect_seconds": 0, "update_seconds": 0}, []
     for run in (one, other):
-        tables.append([row | no_time for row in rows(run / "progress.csv")])
+        tables.append([row | no_time for row in read_csv(run / "progress.csv")])
     assert tables[0] == tables[1] and len(tables[0]) == runs[0][".iteration"]
 
 
@@ -86,12 +80,17 @@ def test_interrupted_and_resumed_equals_uninterrupted(tmp_path, processes, polic
     assert stages == ({"base": 960, "adaptation": 192} if policy == "rma" else {"ppo": 960})
 
 
-def test_a_resumed_run_may_not_change(tmp_path, capsys):
-    words = ["--threads", "1", *SMALL, "--steps", "192", "--out", str(tmp_path)]
+def test_a_finished_run_says_so_mends_its_table_and_may_not_change(tmp_path, capsys):
+    words = ["--threads", "1", *SMALL, "--steps", "384", "--out", str(tmp_path)]
     train.main([*words, "--precision", "fp32"])
-    with pytest.raises(SystemExit) as ended:
+    whole = (tmp_path / "progress.csv").read_text()
+    (tmp_path / "progress.csv").write_text("iteration,steps\n1,x\n")
+    train.main([*words, "--precision", "fp32", "--resume"])
+    told = capsys.readouterr().out
+    assert "it was finished already" in told and "nan" not in told
+    assert (tmp_path / "progress.csv").read_text() == whole
+    with pytest.raises(SystemExit, match="had --seed 0, --precision fp32"):
         train.main([*words, "--precision", "bf16", "--seed", "1", "--resume"])
-    assert "had --seed 0, --precision fp32" in str(ended.value)
     with pytest.raises(SystemExit):
         train.main(words)
     assert "holds a run already" in capsys.readouterr().err
@@ -101,8 +100,7 @@ def test_stairs_begin_with_the_flat_policy(tmp_path):
     """What reads the heights is new: its weights begin at 0, so that an MLP's answers are kept."""
     words, task = ["--threads", "1", *SMALL, "--steps", "192"], TASKS["terrain"]
     flat, stairs = tmp_path / "flat", tmp_path / "stairs"
-    env = LocomotionEnv("a1", 1, num_threads=1, extras=("privileged", "heights"))
-    critic = Critic(env.reset())
+    critic = Critic(env_of(1, extras=("privileged", "heights")).observe())
     train.main([*words, "--policy", "mlp", "--out", str(flat)])
     first = str(flat / "checkpoint.pt")
     more = ["--policy", "mlp", "--task", "terrain", "--out", str(stairs), "--init", first]
@@ -123,60 +121,70 @@ def test_stairs_begin_with_the_flat_policy(tmp_path):
             checkpoint.start_from(path, misfit, critic)
 
 
-def quick(tmp_path, *files):
-    words = ["--episodes", "1", "--threads", "1", "--out", str(tmp_path)]
-    return [*words, "--checkpoints", *files] if files else words
+def experiment(words, cards, folder, *more):
+    """Runs one on fresh policies with these cards; returns the rows of its table."""
+    files = [save_policy(folder / f"{i}.pt", **card) for i, card in enumerate(cards)]
+    quick = ["--seconds", "0.1", "--episodes", "1", "--threads", "1", "--out", str(folder), *more]
+    evaluate.main([*words.split(), *quick, *(["--checkpoints", *files] if files else [])])
+    out = folder / words.replace(" --", "-")
+    assert out.with_suffix(".png").stat().st_size > 1000
+    return [] if words == "curves" else read_csv(out.with_suffix(".csv"))
 
 
-@pytest.mark.parametrize(
-    "name, policies",
-    [
-        ("stiffness", ["mlp", "no-leg-frames", "roam"]),
-        ("gaits", ["rolt"]),
-        ("mechanisms", ["module-pe", "no-leg-frames"]),
-        ("dropout_ratio", ["rolt"]),
-    ],
+MLP, ROLT, MODULE_PE, NO_FRAMES, ROAM = (
+    {"policy": name} for name in ("mlp", "rolt", "module-pe", "no-leg-frames", "roam")
 )
-def test_experiments_on_flat_ground(name, policies, tmp_path, monkeypatch):
+STAIRS = [{"task": "terrain", "scan": True, "policy": name} for name in ("no-pe-drop", "rolt")]
+NOISE = "0 0.05 0.1 0.15 0.2 0.3 0.4".split()
+HEIGHTS = [f"{cm} cm" for cm in "1.4 3.2 5.0 6.8 8.6 10.4 12.2".split()]
+PAIRS = "FR+FL FR+RR FR+RL FL+RR FL+RL RR+RL".split()
+HARMS = "lock", "disable", "weaken to 0.75", "weaken to 0.5", "weaken to 0.25"
+HEXAPODS = "healthy FRT MRT MLC FLC FLT FRC MRC MLT HLT HLC HRT HRC".split()
+REAL_WORLD = ["healthy", "weaken", "weaken FR", "weaken RR", "weaken RL", "box", "skates"]
+DEAD = [f"disable:{leg}_calf" for leg in A1.legs]
+
+
+@pytest.mark.parametrize("words, cards, cases, rows", [
+    ("stiffness", [MLP, NO_FRAMES, ROAM], ["healthy", "FR", "FL", "RR", "RL"], 15),
+    ("damage", [{"robot": "hexapod", "task": "damage"}], HEXAPODS, 13),
+    ("real_world", [{"robot": "go1"}], REAL_WORLD, 7),
+    ("gaits", [ROLT], ["healthy", *STIFF], 20),
+    ("low_frequency", STAIRS, NOISE, 14),
+    ("high_frequency", STAIRS, NOISE, 14),
+    ("stairs", STAIRS, [*HEIGHTS, *(f"{height} blind" for height in HEIGHTS)], 28),
+    ("growth", [{"steps": 1_000_000}, {"steps": 2_000_000}], ["1.0", "2.0"], 6),
+    ("legs", [ROLT, {"task": "two-legs"}], ["healthy", *STIFF, *DEAD], 18),
+    ("matrix", [ROLT], [f"{joint}, {harm}" for joint in A1.joints for harm in HARMS], 60),
+    ("matrix --pairs", [ROLT], [f"{pair}, {harm}" for pair in PAIRS for harm in HARMS], 30),
+    ("senses", [ROLT], list("01234"), 5),
+    ("curves", [ROLT], [], 0),
+])  # fmt: skip
+def test_experiments_tell_of_every_case(words, cards, cases, rows, tmp_path):
+    table = experiment(words, cards, tmp_path)
+    assert [*dict.fromkeys(row["case"] for row in table)] == cases and len(table) == rows
+    names = {"growth": {"rolt"}, "legs": {"rolt stiffness", "rolt two-legs"}}
+    if words in names:
+        assert {row["method"] for row in table} == names[words]
+
+
+def test_no_ratio_is_clipped_with_stored_masks_whatever_the_rate(tmp_path, monkeypatch):
     monkeypatch.setattr(evaluate.PPOConfig, "steps", 3)
-    files = [save_policy(tmp_path / f"{policy}.pt", policy=policy) for policy in policies]
-    evaluate.main([name, "--seconds", "0.1", *quick(tmp_path, *files)])
-    table = rows(tmp_path / f"{name}.csv")
-    assert table and (tmp_path / f"{name}.png").stat().st_size > 1000
-    if name == "stiffness":
-        assert [row["case"] for row in table[:5]] == ["healthy", "FR", "FL", "RR", "RL"]
-        assert len(table) == 15
-    if name == "dropout_ratio":  # none is clipped, whatever the rate
-        stored = [row for row in table if row["method"] == "stored masks"]
-        assert {(row["clipped"], row["off_by"]) for row in stored} == {("0.0000", "1.0000")}
-    if name == "mechanisms":
-        found = {(row["method"], row["case"]): float(row["value"]) for row in table}
-        token = "another's action token"
-        assert found["module-pe", token] == 0.0 < found["no-leg-frames", token]
-        assert found["module-pe", "leg positions equal"] > 0
+    rows = experiment("dropout_ratio", [ROLT], tmp_path)
+    stored = [row for row in rows if row["method"] == "stored masks"]
+    assert {(row["clipped"], row["off_by"]) for row in stored} == {("0.0000", "1.0000")}
 
 
-def test_experiments_of_other_robots(tmp_path):
-    hexapod = save_policy(tmp_path / "h.pt", robot="hexapod", task="damage")
-    evaluate.main(["damage", "--seconds", "0.1", *quick(tmp_path, hexapod)])
-    cases = [row["case"] for row in rows(tmp_path / "damage.csv")]
-    assert cases == "healthy FRT MRT MLC FLC FLT FRC MRC MLT HLT HLC HRT HRC".split()
-    go1 = save_policy(tmp_path / "go1.pt", robot="go1")
-    evaluate.main(["real_world", "--seconds", "0.1", *quick(tmp_path, go1)])
-    cases = [row["case"] for row in rows(tmp_path / "real_world.csv")]
-    assert cases == ["healthy", "weaken", "weaken FR", "weaken RR", "weaken RL", "box", "skates"]
+def test_mechanisms_tell_what_a_policy_does_not_read(tmp_path):
+    rows = experiment("mechanisms", [MODULE_PE, NO_FRAMES], tmp_path)
+    found = {(row["method"], row["case"]): float(row["value"]) for row in rows}
+    token = "another's action token"
+    assert found["module-pe", token] == 0.0 < found["no-leg-frames", token]
+    assert found["module-pe", "leg positions equal"] > 0
 
 
-def test_experiments_on_stairs(tmp_path):
-    card, names = {"task": "terrain", "scan": True}, ("no-pe-drop", "rolt")
-    files = [save_policy(tmp_path / f"{name}.pt", policy=name, **card) for name in names]
-    for name in ("low_frequency", "high_frequency", "stairs", "attention"):
-        evaluate.main([name, "--seconds", "0.1", *quick(tmp_path, *files)])
-    noisy, steps = (rows(tmp_path / f"{name}.csv")[::2] for name in ("low_frequency", "stairs"))
-    assert [row["case"] for row in noisy] == "0 0.05 0.1 0.15 0.2 0.3 0.4".split()
-    assert [row["case"] for row in steps[:2]] == ["1.4 cm", "3.2 cm"]
-    entropies = [float(row["entropy"]) for row in rows(tmp_path / "attention.csv")]
-    assert len(entropies) == 4 and min(entropies) > 0.8  # what has learned nothing is even
+def test_what_has_learned_nothing_looks_everywhere(tmp_path):
+    entropies = [float(row["entropy"]) for row in experiment("attention", STAIRS, tmp_path)]
+    assert len(entropies) == 4 and min(entropies) > 0.8
 
 
 def test_all_shipped_seeds_are_put_together(tmp_path, monkeypatch):
@@ -185,40 +193,39 @@ def test_all_shipped_seeds_are_put_together(tmp_path, monkeypatch):
     for name, seed in (("rolt", 0), ("rolt-seed2", 2), ("rolt-seed1", 1), ("mlp", 0)):
         path = tmp_path / "checkpoints" / f"a1-stiffness-{name}.pt"
         save_policy(path, seed=seed, policy=name.split("-")[0])
-    evaluate.main(["stiffness", "--methods", "rolt", "--seconds", "0.1", *quick(tmp_path)])
-    assert [row["seed"] for row in rows(tmp_path / "stiffness.csv")][::5] == ["0", "1", "2"]
+    rows = experiment("stiffness", [], tmp_path, "--methods", "rolt")
+    assert [row["seed"] for row in rows][::5] == ["0", "1", "2"]
 
 
-@pytest.mark.parametrize(
-    "script, words, says",
-    [
-        (train, ["--robot", "a2"], "a1"),
-        (train, ["--task", "damage"], "is for hexapod"),
-        (train, ["--envs", "-3"], "invalid count value"),
-        (train, ["--envs", "7", "--threads", "2"], "do not divide"),
-        (train, ["--epochs", "1", "--minibatches", "1"], "two steps"),
-        (train, ["--resume", "--out", "nowhere"], "nothing to resume"),
-        (train, ["--out", ""], "is empty"),
-        (train, [*SMALL, "--threads", "1", "--out", "/proc/here"], "/proc/here"),
-        (train, [*SMALL, "--out", "new", "--threads", "1", "--init", "text.pt"], "not a whole"),
-        (evaluate, ["stiffness", "--robot", "a2"], "invalid choice"),
-        (evaluate, ["stiffness", "--robot", "hexapod"], "no such checkpoints/hexapod-st"),
-        (evaluate, ["stiffness", "--episodes", "0"], "at least one"),
-        (evaluate, ["stiffness", "--checkpoints", "missing.pt"], "no checkpoint missing.pt"),
-        (evaluate, ["stiffness", "--checkpoints", "text.pt"], "not a whole checkpoint"),
-        (evaluate, ["stiffness", "--checkpoints", "old.pt"], "another version"),
-        (evaluate, ["stiffness", "--checkpoints", "other.pt"], "on the hexapod, not on the a1"),
-        (evaluate, ["stiffness", "--checkpoints", "misfit.pt"], "does not fit"),
-        (evaluate, ["stiffness", "--methods", "mlp", "--checkpoints", "good.pt"], "not allowed"),
-        (evaluate, ["stiffness", "--checkpoints", "good.pt", "./good.pt", "same.pt"], "the same"),
-        (watch, ["--checkpoint", "good.pt", "--out", "a.gif", "--fault", "melt:FR"], "lock:FR"),
-        (watch, ["--checkpoint", "good.pt", "--out", "walk.mp4"], "is a .gif"),
-    ],
-)
+@pytest.mark.parametrize("script, words, says", [
+    (train, ["--robot", "a2"], "a1"),
+    (train, ["--task", "damage"], "is for hexapod"),
+    (train, ["--envs", "-3"], "invalid count value"),
+    (train, ["--envs", "7", "--threads", "2"], "do not divide"),
+    (train, ["--epochs", "1", "--minibatches", "1"], "two steps"),
+    (train, ["--resume", "--out", "nowhere"], "nothing to resume"),
+    (train, ["--out", ""], "is empty"),
+    (train, [*SMALL, "--threads", "1", "--out", "/proc/here"], "/proc/here"),
+    (train, [*SMALL, "--out", "new", "--threads", "1", "--init", "text.pt"], "not a whole"),
+    (evaluate, ["stiffness", "--robot", "a2"], "invalid choice"),
+    (evaluate, ["stiffness", "--robot", "hexapod"], "no such checkpoints/hexapod-st"),
+    (evaluate, ["stiffness", "--episodes", "0"], "at least one"),
+    (evaluate, ["stiffness", "--checkpoints", "missing.pt"], "no checkpoint missing.pt"),
+    (evaluate, ["stiffness", "--checkpoints", "text.pt"], "not a whole checkpoint"),
+    (evaluate, ["stiffness", "--checkpoints", "old.pt"], "another version"),
+    (evaluate, ["stiffness", "--checkpoints", "other.pt"], "on the hexapod, not on the a1"),
+    (evaluate, ["stiffness", "--checkpoints", "misfit.pt"], "does not fit"),
+    (evaluate, ["stiffness", "--methods", "mlp", "--checkpoints", "good.pt"], "not allowed"),
+    (evaluate, ["stiffness", "--checkpoints", "good.pt", "./good.pt", "same.pt"], "the same"),
+    (watch, ["--checkpoint", "good.pt", "--out", "a.gif", "--fault", "melt:FR"], "lock:FR"),
+    (watch, ["--checkpoint", "good.pt", "--out", "walk.mp4"], "is a .gif"),
+    (export, ["roam.pt", "exported"], "ROAM draws its behaviour"),
+])  # fmt: skip
 def test_wrong_input_ends_in_one_line(script, words, says, tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     save_policy("good.pt")
     save_policy("other.pt", robot="hexapod", task="damage")
+    save_policy("roam.pt", policy="roam")
     good = checkpoint.load("good.pt")
     checkpoint.save(good, Path("same.pt"))
     checkpoint.save(good | {"policy": "module-pe"}, Path("misfit.pt"))
@@ -260,14 +267,3 @@ def test_a_checkpoint_is_never_executed(tmp_path):
 def test_the_model_needs_torch_alone():
     imports = re.findall(r"^(?:from|import) (\w+)", (ROOT / "rolt.py").read_text(), re.MULTILINE)
     assert set(imports) - sys.stdlib_module_names == {"torch"}
-
-
-def test_a_finished_run_says_so_and_mends_its_table(tmp_path, capsys):
-    words = ["--threads", "1", *SMALL, "--steps", "384", "--out", str(tmp_path)]
-    train.main(words)
-    whole = (tmp_path / "progress.csv").read_text()
-    (tmp_path / "progress.csv").write_text("iteration,steps\n1,x\n")
-    train.main([*words, "--resume"])
-    told = capsys.readouterr().out
-    assert "it was finished already" in told and "nan" not in told
-    assert (tmp_path / "progress.csv").read_text() == whole

@@ -1,19 +1,19 @@
 """The ground, the scandots that read it, their noise, and the curriculum."""
 
+from dataclasses import replace
+
 import mujoco
 import numpy as np
 import pytest
 
-from env import EnvConfig, LocomotionEnv
+from conftest import QUIET, env_of, rest
+from env import EnvConfig
 from noise import NoisyScan, ScanNoise, parse_noise, scan
 from robots import A1, build_model
 from terrain import KINDS, TRAINING_MAP, Terrain, rise
 
 STAIRS = Terrain(("stairs",), (3,))  # steps of 0.104 m and 0.31 m that begin at x = 0.5
-STILL = EnvConfig(
-    start_pose=(1.0, 1.0), start_speed=0.0, forward_speed=(0.0, 0.0), push_speed=0.0,
-    start_rows=1, climb=False,
-)  # fmt: skip
+STILL = replace(QUIET, forward_speed=(0.0, 0.0), start_rows=1, climb=False)
 
 
 def test_height_is_where_rays_end():
@@ -40,11 +40,6 @@ def test_stairs_by_hand():
     assert np.allclose(STAIRS.height(x, np.full(9, 3.6)), 0)  # the strip beside them
 
 
-def test_unknown_terrain_is_refused():
-    with pytest.raises(ValueError, match="unknown kind of terrain lava; there is flat, slope"):
-        Terrain(("lava",), (0,))
-
-
 class Ramp:
     """Ground as high as x, everywhere."""
 
@@ -62,8 +57,7 @@ def test_the_scan_turns_with_the_robot():
 
 
 def test_the_env_reads_the_ground_around_its_robots():
-    env = LocomotionEnv("a1", 2, terrain=STAIRS, config=STILL, num_threads=1)
-    env.reset()
+    env = env_of(2, terrain=STAIRS, config=STILL, extras=("heights",))
     x, y, z = env.position.T
     assert np.allclose(x, 0) and np.all(np.abs(y) <= 1)
     heights = env.observe().heights / 20
@@ -71,13 +65,18 @@ def test_the_env_reads_the_ground_around_its_robots():
     assert np.allclose(heights[:, 13:], (z - 0.3 - rise(3))[:, None, None])  # ahead: the first step
 
 
+def test_unknown_ground_and_noise_are_refused():
+    with pytest.raises(ValueError, match="unknown kind of terrain lava; there is flat, slope"):
+        Terrain(("lava",), (0,))
+    for text in ("fog", "sigma", "sigma:-1", "sigma:nan", "missing:13", "missing:1.5", ""):
+        with pytest.raises(ValueError, match="write clean, offset:0.3"):
+            parse_noise(text)
+
+
 def test_noise_is_read_from_words():
     assert parse_noise("clean") == ScanNoise()
     noise = ScanNoise(offset=0.3, missing=4, sigma=0.1)
     assert parse_noise("offset:0.3+missing:4+sigma:0.1") == noise
-    for text in ("fog", "sigma", "sigma:-1", "sigma:nan", "missing:13", "missing:1.5", ""):
-        with pytest.raises(ValueError, match="write clean, offset:0.3"):
-            parse_noise(text)
 
 
 def drawn(n: int, noise: str) -> NoisyScan:
@@ -86,9 +85,16 @@ def drawn(n: int, noise: str) -> NoisyScan:
     return scan
 
 
-def test_low_frequency_noise_moves_whole_patches_by_its_scale():
+def by_patch(points: np.ndarray) -> np.ndarray:
+    """(n, 16, 12, ...) -> (n, 12, 16, ...), 16 points of each of ROLT's patches."""
+    n, more = len(points), points.shape[3:]
+    squares = points.reshape(n, 4, 4, 3, 4, *more).swapaxes(2, 3)
+    return squares.reshape(n, 12, 16, *more)
+
+
+def test_low_frequency_noise_moves_whole_patches_by_its_scale_and_missing_ones_are_whole():
     shifts = drawn(2000, "offset:0.3").shift
-    patches = shifts.reshape(2000, 4, 4, 3, 4, 3).swapaxes(2, 3).reshape(2000, 12, 16, 3)
+    patches = by_patch(shifts)
     assert np.array_equal(patches, np.repeat(patches[:, :, :1], 16, axis=2))
     moved = np.linalg.norm(patches[:, :, 0], axis=2)
     assert np.all((moved > 0).sum(axis=1) == 4) and np.allclose(moved[moved > 0], 0.3)
@@ -96,6 +102,8 @@ def test_low_frequency_noise_moves_whole_patches_by_its_scale():
     assert np.allclose(directions.mean(0), 0, atol=0.03)
     assert np.allclose(directions.var(0), 1 / 3, atol=0.02)
     assert np.array_equal(shifts, drawn(2000, "offset:0.3").shift)
+    missing = by_patch(drawn(50, "missing:4").missing)
+    assert np.array_equal(missing.all(2), missing.any(2)) and np.all(missing.all(2).sum(1) == 4)
 
 
 def test_high_frequency_noise_has_its_scale_and_no_order():
@@ -111,12 +119,6 @@ def test_high_frequency_noise_has_its_scale_and_no_order():
     assert (ramp - expected).std() == pytest.approx(0.1 * 2**0.5, rel=0.03)
 
 
-def test_missing_points_are_rolts_patches():
-    missing = drawn(50, "missing:4").missing
-    patches = missing.reshape(50, 4, 4, 3, 4).swapaxes(2, 3).reshape(50, 12, 16)  # as in ROLT
-    assert np.array_equal(patches.all(2), patches.any(2)) and np.all(patches.all(2).sum(1) == 4)
-
-
 def test_a_lateral_shift_reads_the_ground_elsewhere():
     """On a ramp a point read 0.2 m further ahead is 0.2 m higher; a vertical shift is anywhere."""
     position, yaw, shift = np.array([[0, 0, 0.3]]), np.array([0.0]), np.zeros((1, 16, 12, 3))
@@ -129,12 +131,11 @@ def test_a_lateral_shift_reads_the_ground_elsewhere():
 
 
 def test_noise_changes_the_scan_and_nothing_else():
-    traces, noisy = [], "offset:0.2+missing:2+sigma:0.1"
-    how = {"seed": 3, "extras": ("heights",), "terrain": STAIRS, "num_threads": 1}
-    for noise in ("clean", noisy):
-        env = LocomotionEnv("a1", 4, noise=noise, **how)
-        traces.append((env.reset(), env.step(np.zeros((4, 12)))[0]))
-    (clean, clean_next), (noisy, noisy_next) = traces
+    traces = []
+    for noise in ("clean", "offset:0.2+missing:2+sigma:0.1"):
+        env = env_of(4, extras=("heights",), terrain=STAIRS, noise=noise)
+        traces += [env.observe(), rest(env)[0]]
+    clean, clean_next, noisy, noisy_next = traces
     assert np.array_equal(clean.legs, noisy.legs)
     assert np.array_equal(clean_next.legs, noisy_next.legs)
     assert not np.array_equal(clean.heights, noisy.heights)
@@ -152,30 +153,26 @@ def test_curriculum_by_hand():
 
 def test_robots_climb_when_their_episode_ends():
     config = EnvConfig(forward_speed=(0.5, 0.5), start_rows=1)
-    env = LocomotionEnv("a1", 2, terrain=TRAINING_MAP, config=config, num_threads=1)
-    env.reset()
+    env = env_of(2, terrain=TRAINING_MAP, config=config)
     assert list(env.row) == [0, 0] and list(env.column) == [0, 1]
     env.age[:] = env.episode_steps - 1
     env.world.bind("qpos")[0, 0] = 4.5
-    env.step(np.zeros((2, 12)))
+    rest(env)
     assert list(env.row) == [1, 0]
     assert env.position[0, 0] == pytest.approx(8.0)
     assert env.position[1, 1] == pytest.approx(8.0, abs=1.0)
     env.world.bind("qvel")[0] = np.nan  # diverged, it is put at (0, 0), far from where it began
-    env.step(np.zeros((2, 12)))
+    rest(env)
     assert list(env.row) == [1, 0]
 
 
 def test_a_robot_stands_on_every_tile():
     rows, columns = len(TRAINING_MAP.levels), len(TRAINING_MAP.columns)
-    how = {"extras": ("heights",), "terrain": TRAINING_MAP, "config": STILL, "num_threads": 2}
-    env = LocomotionEnv("a1", rows * columns, **how)
-    env.reset()
+    env = env_of(rows * columns, extras=("heights",), terrain=TRAINING_MAP, config=STILL)
     env.row[:] = np.repeat(np.arange(rows), columns)
     env._reset(np.arange(env.num_envs))
     heights = env.observe().heights
     assert np.all(heights[:, 4:12, 3:9] == heights[:, 4:5, 3:4])  # level ground underneath
     for _ in range(100):
-        *_, terminated, _, _ = env.step(np.zeros((env.num_envs, 12)))
-        assert not terminated.any()
+        assert not rest(env)[2].any()
     assert np.all(env.position[:, 2] > 0.2) and np.all(env.gravity[:, 2] < -0.98)

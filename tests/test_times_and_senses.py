@@ -4,36 +4,19 @@ import mujoco
 import numpy as np
 import pytest
 
-from env import EnvConfig, LocomotionEnv
-from faults import HEALTHY, fault_now, faulty_model, harms_of
-from robots import A1, CONTROL_DT, SUBSTEPS, build_model
+from conftest import env_of, env_with, flail, go_on_alike, rest
+from faults import HEALTHY, fault_now, faulty_model
+from robots import A1, build_model
 
-QUIET = EnvConfig(
-    push_speed=0.0, start_speed=0.0, start_pose=(1.0, 1.0), friction=(1.0, 1.0),
-    forward_speed=(0.5, 0.5), heading=(0.0, 0.0),
-)  # fmt: skip
 ALL = (
     "lock:FR_calf@0.1:0.2+payload:trunk:2@0.1:0.2+blow:trunk:3@0.14:+late:RL:0.02@0.1:0.2"
     "+bias:FL:0.2@0.1:0.2+freeze:RR@0.1:0.2+weaken:FL:0.5@0.1:0.2"
 )
 
 
-def make(*faults, robot="a1", threads=1, seed=0, extras=()):
-    """An env of one robot a fault, just reset."""
-    pairs = [(1.0, fault) for fault in faults]
-    env = LocomotionEnv(robot, len(faults), seed, threads, pairs, QUIET, extras)
-    env.pin_faults(list(faults))
-    env.reset()
-    return env
-
-
-def flail(env, rng):
-    return env.step(rng.normal(size=(env.num_envs, env.num_actions)))
-
-
 def test_a_fault_strikes_and_goes_to_the_step():
     """0.1 s is 5 steps, 0.2 s 10; the next episode begins healthy."""
-    env, rng = make("lock:FR_calf@0.1:0.2", HEALTHY), np.random.default_rng(0)
+    env, rng = env_with("lock:FR_calf@0.1:0.2", HEALTHY), np.random.default_rng(0)
     seen = []
     for _ in range(12):
         flail(env, rng)
@@ -42,26 +25,26 @@ def test_a_fault_strikes_and_goes_to_the_step():
     for _ in range(8):
         env.reset()
         assert not env.world.bind("eq_active").any() and env.fault_now == [HEALTHY] * 2
-        [flail(env, rng) for _ in range(6)]
+        flail(env, rng, 6)
         assert env.fault_now == ["lock:FR_calf", HEALTHY]
 
 
-def test_a_lock_that_strikes_holds_where_it_is():
-    env, rng = make("lock:FR_calf@0.1:"), np.random.default_rng(0)
-    for step in range(30):
-        if step == 5:
-            before = env.joint_error[0, 0, 2]
-        flail(env, rng)
+def test_a_lock_that_strikes_holds_where_it_is_also_when_another_fault_comes():
+    env, rng = env_with("lock:FR_calf@0.1:+weaken:RL:0.5@0.2:"), np.random.default_rng(0)
+    flail(env, rng, 5)
+    before = env.joint_error[0, 0, 2]
+    flail(env, rng)
+    seat = env.fault_writer.values["eq_data"][0, 2, 0]
+    flail(env, rng, 24)
+    assert env.fault_now[0].count("+") == 1 and env.fault_writer.values["eq_data"][0, 2, 0] == seat
     assert abs(before) > 0.03 and env.joint_error[0, 0, 2] == pytest.approx(before, abs=0.01)
 
 
 def test_what_has_ended_leaves_nothing_behind():
     """The state after it, given to a robot whose faults never come, goes on alike to the bit."""
     later = ALL.replace("@0.1:0.2", "@8:9").replace("@0.14", "@8")
-    env, other = make(ALL, ALL), make(later, later)
-    rng = np.random.default_rng(0)
-    for _ in range(10):
-        flail(env, rng)
+    env, other, rng = env_with(ALL, ALL), env_with(later, later), np.random.default_rng(0)
+    flail(env, rng, 10)
     assert env.fault_now[0].count("+") == 5  # the blow is over
     flail(env, rng)
     flail(other, rng)
@@ -74,40 +57,29 @@ def test_what_has_ended_leaves_nothing_behind():
 
 
 def test_an_interrupted_env_goes_on_alike_in_the_middle_of_faults():
-    whole, again = make(ALL, HEALTHY), make(ALL, HEALTHY)
-    rng = np.random.default_rng(0)
-    for _ in range(8):
-        flail(whole, rng)
+    whole, again, rng = env_with(ALL, HEALTHY), env_with(ALL, HEALTHY), np.random.default_rng(0)
+    flail(whole, rng, 8)
     again.load_state_dict(whole.state_dict())
-    for _ in range(8):
-        action = rng.normal(size=(2, 12))
-        one, two = whole.step(action)[0], again.step(action)[0]
-        assert all(np.array_equal(x, y) for x, y in zip(one, two))
+    go_on_alike(whole, again, rng, 8)
 
 
 def test_what_comes_and_goes_repeats_with_the_seed():
     """0.2 s of every second: 10 steps of 50 in a row, at moments that differ."""
     fault = "lock:FR_calf@0.2/1"
-    pattern = np.array([fault_now(fault, t, (3, 1)) != HEALTHY for t in range(500)])
+    pattern, again, other = (
+        np.array([fault_now(fault, t, luck) != HEALTHY for t in range(500)])
+        for luck in ((3, 1), (3, 1), (3, 2))
+    )
     assert pattern.reshape(10, 50).sum(axis=1).tolist() == [10] * 10
     starts = np.flatnonzero(np.diff(pattern, prepend=False) & pattern) % 50
     assert len(starts) == 10 and len(set(starts.tolist())) > 5
-    again = [fault_now(fault, t, (3, 1)) != HEALTHY for t in range(500)]
-    assert again == pattern.tolist()
-    assert [fault_now(fault, t, (3, 2)) != HEALTHY for t in range(500)] != again
-    envs = [make(fault, fault, threads=threads) for threads in (1, 2)]
-    rngs = [np.random.default_rng(0), np.random.default_rng(0)]
-    for _ in range(60):
-        one, two = (flail(env, rng) for env, rng in zip(envs, rngs))
-        assert np.array_equal(one[0].legs, two[0].legs) and envs[0].fault_now == envs[1].fault_now
-    assert envs[0].fault_now[0] in ("lock:FR_calf", HEALTHY)
+    assert np.array_equal(again, pattern) and not np.array_equal(other, pattern)
 
 
 def test_a_late_motor_counts_in_steps_of_the_simulation():
     """10 ms are 2 of 5 ms; before the first target it holds the default pose, as all do."""
-    env = make("late:FR_hip:0.01", HEALTHY)
+    env, forces = env_with("late:FR_hip:0.01", HEALTHY), []
     env.world.bind("ctrl")[:, 0] = 0.5  # rad, asked of both
-    forces = []
     for _ in range(4):
         env.world.step(nstep=1)
         forces.append(env.world.bind("actuator_force")[:, 0].copy())
@@ -120,7 +92,7 @@ def test_a_payload_is_felt():
     healthy = build_model(A1)
     model = faulty_model("payload:trunk:2", A1, healthy)
     assert model.body_subtreemass[1] == pytest.approx(healthy.body_subtreemass[1] + 2)
-    env = make("payload:trunk:2", HEALTHY)
+    env = env_with("payload:trunk:2", HEALTHY)
     env.world.forward()
     weight = env.world.bind("qfrc_bias")[:, 2]
     assert weight == pytest.approx([14.453 * 9.81, 12.453 * 9.81], abs=0.01)
@@ -128,11 +100,10 @@ def test_a_payload_is_felt():
 
 def test_a_blow_gives_its_impulse_once():
     """In free fall: 5 N s on 12.453 kg to the left, all of it in one control step."""
-    env = make("blow:trunk:5@0.04:", HEALTHY)
+    env, momentum = env_with("blow:trunk:5@0.04:", HEALTHY), []
     env.world.bind("qpos")[:, 2] = 5.0
-    momentum = []
     for _ in range(5):
-        env.step(np.zeros((2, 12)))
+        rest(env)
         data = [env.world.get_data(i) for i in range(2)]
         for robot in data:
             mujoco.mj_subtreeVel(env.model, robot)
@@ -143,17 +114,15 @@ def test_a_blow_gives_its_impulse_once():
 
 
 def test_senses_change_what_is_seen_and_not_what_moves():
-    faults = (HEALTHY, "freeze:FR_calf@0.1:", "bias:FL:0.2", "mute:RR", "imu:trunk:0.1",
-              "odometry:trunk:0.5")  # fmt: skip
-    env, rng = make(*faults), np.random.default_rng(0)
+    faults = "freeze:FR_calf@0.1:", "bias:FL:0.2", "mute:RR", "imu:trunk:0.1", "odometry:trunk:0.5"
+    env, rng = env_with(HEALTHY, *faults), np.random.default_rng(0)
     for step in range(20):
         observation, *_ = env.step(np.tile(rng.normal(size=(1, 12)), (6, 1)))
         if step == 5:
             held = env.joint_error[0, 0, 2], env.joint_velocity[0, 0, 2]  # the first one it missed
     qpos = env.world.bind("qpos")
     assert (qpos == qpos[0]).all()  # the same motion of all
-    legs = observation.legs[:, :, -1]
-    healthy, frozen, biased, mute, tilted, slow = legs
+    healthy, frozen, biased, mute, tilted, slow = observation.legs[:, :, -1]
     assert frozen[0, [2, 5]] == pytest.approx([4 * held[0], 0.2 * held[1]], rel=1e-5)
     assert frozen[0, 2] != healthy[0, 2] and frozen[1:].tolist() == healthy[1:].tolist()
     beyond = biased[1, :3] - healthy[1, :3]  # of a left leg: the hip is mirrored
@@ -168,7 +137,7 @@ def test_senses_change_what_is_seen_and_not_what_moves():
 
 
 def test_what_freezes_again_after_a_reset_holds_its_own_reading():
-    env, rng = LocomotionEnv("a1", 1, 0, 1, [(1.0, "freeze:FR_calf")]), np.random.default_rng(0)
+    env, rng = env_of(1, faults=[(1.0, "freeze:FR_calf")]), np.random.default_rng(0)
     readings = []
     for _ in range(2):  # poses at the start vary
         readings.append(env.reset().legs[0, 0, -1, 2])
@@ -178,43 +147,10 @@ def test_what_freezes_again_after_a_reset_holds_its_own_reading():
     assert readings[0] != readings[1]
 
 
-def test_an_older_lock_stays_where_it_holds_when_another_fault_comes():
-    env, rng = make("lock:FR_calf@0.1:+weaken:RL:0.5@0.2:"), np.random.default_rng(0)
-    for _ in range(6):
-        flail(env, rng)
-    seat = env.fault_writer.values["eq_data"][0, 2, 0]
-    for _ in range(10):
-        flail(env, rng)
-    assert env.fault_now[0].count("+") == 1 and env.fault_writer.values["eq_data"][0, 2, 0] == seat
-
-
 def test_critics_are_told_while_it_lasts():
-    env = make("payload:trunk:2@0.1:0.2", "bias:FL:0.2", extras=("privileged",))
+    env = env_with("payload:trunk:2@0.1:0.2", "bias:FL:0.2", extras=("privileged",))
     rng = np.random.default_rng(0)
     told = [flail(env, rng)[0].privileged[:, -2:].tolist() for _ in range(12)]
     bias = pytest.approx([0.2, 0])
     assert [one[1] for one in told] == [bias] * 12
     assert [one[0] for one in told] == [[0, 0]] * 5 + [[0, 2]] * 5 + [[0, 0]] * 2
-
-
-@pytest.mark.parametrize("text, says", [
-    ("lock:FR_calf@12:5", "a later end"), ("lock:FR_calf@5", "cannot read"),
-    ("lock:FR_calf@-1:5", "a later end"), ("lock:FR_calf@2/1", "not shorter"),
-    ("late:FR:-0.01", "from 0 to 0.04"), ("late:FR:0.05", "from 0 to 0.04"),
-    ("bias:FR:nan", "from -7 to 7"), ("bias:XX:0.1", "no joint or leg"),
-    ("payload:roof:1", "no roof"), ("blow:trunk:inf", "from -100 to 100"),
-    ("blow:trunk:5", "when is the blow"), ("lock:FR_calf@5:inf", "cannot read"),
-    ("lock:FR_calf@nan:", "cannot read"),
-])  # fmt: skip
-def test_what_cannot_be_is_refused_at_once(text, says):
-    with pytest.raises(ValueError, match=says):
-        make(text)
-    if "@" not in text and says != "when is the blow":
-        with pytest.raises(ValueError, match=says):
-            make(text + "@5:")
-
-
-def test_words_are_whole():
-    assert harms_of("weaken:RL:0.5@5:12")[0][3:] == ("weaken:RL:0.5", 250, 600, 0)
-    assert fault_now("weaken:RL:0.5@5:12+lock:FR_calf", 600, (0,)) == "lock:FR_calf"
-    assert SUBSTEPS * 0.005 == CONTROL_DT

@@ -4,11 +4,11 @@ import re
 import shlex
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).resolve().parent.parent
+from conftest import ROOT
+
 TEXT = (ROOT / "TOUR.md").read_text()
 QUOTES = re.findall(r"`(\w+\.py)`, line (\d+):\n\n```python\n(.*?)```", TEXT, re.DOTALL)
 COMMANDS = re.findall(r"^    python (.*)$", TEXT, re.MULTILINE)

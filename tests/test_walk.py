@@ -1,6 +1,5 @@
 """Every number of the results: walks on a world that plays back what was written by hand, gaits."""
 
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -9,13 +8,13 @@ import torch
 
 import walk
 from baselines import METHODS, make_policy
+from beyond import recovery
 from checkpoint import load_policy
+from conftest import ROOT
 from env import CONTROL_DT, Observation
 from faults import HEALTHY, TASKS
 from robots import A1
 from terrain import Terrain
-
-ROOT = Path(__file__).resolve().parent.parent
 
 
 class Playback:
@@ -56,20 +55,15 @@ def policy(monkeypatch):
     return type("Policy", (), {"extras": (), "leg_frames": True, "__call__": staticmethod(acts)})()
 
 
-def test_an_episode_ends_with_the_first_fall(policy):
-    faults = [HEALTHY, "lock:FR_calf"]
+def test_an_episode_ends_with_the_first_fall_or_where_a_simulation_that_diverges_last_was(
+    policy, capsys
+):
+    faults = [HEALTHY, "lock:FR_calf", "skate:FR"]
     walked = walk.take_a_walk(policy, "a1", faults, 0.75, 10 * CONTROL_DT)
-    assert walked.distance == pytest.approx([10 * 0.1, 3 * 0.2])
-    assert walked.fall_time == pytest.approx([10 * CONTROL_DT, 3 * CONTROL_DT])
-    assert walked.returns == pytest.approx([10, 3]) and walked.fell.tolist() == [False, True]
-
-
-def test_a_simulation_that_diverges_ends_where_it_last_was_and_is_told(policy, capsys):
-    faults = [HEALTHY, "skate:FR"]
-    walked = walk.take_a_walk(policy, "a1", faults, 0.75, 10 * CONTROL_DT)
-    assert walked.distance == pytest.approx([10 * 0.1, 3 * 0.2])
-    assert walked.returns == pytest.approx([10, 3])
-    assert walked.fall_time == pytest.approx([10 * CONTROL_DT, 4 * CONTROL_DT])
+    assert walked.distance == pytest.approx([10 * 0.1, 3 * 0.2, 3 * 0.3])
+    assert walked.fall_time == pytest.approx([10 * CONTROL_DT, 3 * CONTROL_DT, 4 * CONTROL_DT])
+    assert walked.returns == pytest.approx([10, 3, 3])
+    assert walked.fell.tolist() == [False, True, True]
     assert capsys.readouterr().err == "simulations that diverged, counted as falls: 1\n"
 
 
@@ -123,3 +117,21 @@ def test_methods_act_as_they_did_when_their_results_were_measured():
         how = policy, "a1", ["lock:FR_calf"], 0.75, 0.6, 0, 1
         poses = walk.take_a_walk(*how, terrain=course).poses
         assert poses[-1, 0, 0] == pytest.approx(x, abs=1e-3)
+
+
+def played(x: np.ndarray, steps: int, fell: bool) -> SimpleNamespace:
+    """A walk of one robot that is at x (T,) m."""
+    return SimpleNamespace(poses=x[:, None, None], steps=[steps], fell=[fell])
+
+
+def test_recovery_is_the_time_until_the_last_second_was_fast_enough():
+    """0.8 m/s; 0.2 m/s from 5 to 13 s; then 0.8: 80 % of that, 0.64, is the mean over a second of
+    which 0.733 were fast: 1 + 0.74 s after the fault's end, on the grid of 20 ms."""
+    t = np.arange(1000) * CONTROL_DT
+    x = np.where(t < 5, 0.8 * t, np.where(t < 13, 4 + 0.2 * (t - 5), 5.6 + 0.8 * (t - 13)))
+    told = recovery(played(x, 1000, False), 0)
+    assert float(told["recovery_s"]) == pytest.approx(1.74, abs=0.001)
+    assert float(told["during"]) == pytest.approx(0.25)
+    fallen = recovery(played(x, 700, True), 0)
+    assert float(fallen["recovery_s"]) == 8 and float(fallen["during"]) == pytest.approx(0.25)
+    assert recovery(played(x, 300, True), 0) == {"during": "0.000", "recovery_s": "8.000"}
