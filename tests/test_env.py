@@ -158,6 +158,17 @@ def test_timeout_gives_the_true_last_observation_and_restarts():
 REACH = 0.2 * np.cos(0.8) + 0.2 * np.cos(0.7) + 0.02  # m: thigh, calf, foot; a standing trunk
 
 
+def test_a_foot_in_the_air_for_one_step_has_not_stepped():
+    env, touchdowns = env_of(1), []
+    env._contacts = np.zeros(env._contacts.shape)
+    for down in (1, 0, 1, 0, 0, 1):
+        env._contacts[0, env._foot_sensors[0]] = down
+        env._read_contacts()
+        env.air_time *= ~env.foot_contact  # as `step` does after the rewards
+        touchdowns.append(bool(env.touchdown[0, 0]))
+    assert touchdowns == [False] * 5 + [True]
+
+
 def test_air_time_of_a_fall_from_one_metre():
     """sqrt(2 m / g) = 0.452 s: all four feet touch down at once, in the 23rd step (0.46 s)."""
     env = env_of(1, config=QUIET)

@@ -41,7 +41,7 @@ def put_into_mirrored_states(env) -> None:
 def test_a_mirrored_robot_says_the_same_in_leg_frames_alone(name, leg_frames):
     env = env_of(2, name, EnvConfig(leg_frames=leg_frames))
     put_into_mirrored_states(env)
-    seen, image = env._frame()
+    seen, image = env._newest_step()
     assert np.array_equal(image, seen[mirror_of(env.robot)[0]]) == leg_frames
     assert not np.array_equal(seen[0], seen[1])  # a leg's own numbers are there
 

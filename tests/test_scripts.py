@@ -18,7 +18,7 @@ import watch
 from baselines import make_policy
 from conftest import ROOT, env_of, save_policy
 from faults import STIFF, TASKS
-from ppo import Critic
+from ppo import Critic, PPOConfig
 from robots import A1
 from walk import read_csv
 
@@ -168,7 +168,7 @@ def test_experiments_tell_of_every_case(words, cards, cases, rows, tmp_path):
 
 
 def test_no_ratio_is_clipped_with_stored_masks_whatever_the_rate(tmp_path, monkeypatch):
-    monkeypatch.setattr(evaluate.PPOConfig, "steps", 3)
+    monkeypatch.setattr(PPOConfig, "steps", 3)
     rows = experiment("dropout_ratio", [ROLT], tmp_path)
     stored = [row for row in rows if row["method"] == "stored masks"]
     assert {(row["clipped"], row["off_by"]) for row in stored} == {("0.0000", "1.0000")}

@@ -53,7 +53,7 @@ def test_what_has_ended_leaves_nothing_behind():
         action = rng.normal(size=(2, 12))
         env.step(action), other.step(action)
     assert np.array_equal(env.world.bind("qpos"), other.world.bind("qpos"))
-    assert np.array_equal(env._frame()[..., :6], other._frame()[..., :6])
+    assert np.array_equal(env._newest_step()[..., :6], other._newest_step()[..., :6])
 
 
 def test_an_interrupted_env_goes_on_alike_in_the_middle_of_faults():
