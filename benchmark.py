@@ -99,7 +99,9 @@ def main(argv: list[str] | None = None) -> None:
     torch.set_num_threads(1)
     for robot in args.robots:
         for name in args.policies:
-            words = ["--robot", robot, "--policy", name, *["--scan"] * args.scan]
+            words = ["--robot", robot, "--policy", name]
+            if args.scan:
+                words.append("--scan")
             time_to_walk(words) if args.what == "walk" else iterations(words)
 
 

@@ -161,7 +161,8 @@ def build_model(
             motor = spec.add_actuator(name=name, target=name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
             motor.set_to_position(kp=robot.stiffness, kv=robot.damping)
             motor.forcerange = [-link.effort, link.effort]
-            motor.nsample = late * (1 + round(MAX_DELAY / PHYSICS_DT))
+            if late:
+                motor.nsample = 1 + round(MAX_DELAY / PHYSICS_DT)
             lock = spec.add_equality(name=name, name1=name, type=mujoco.mjtEq.mjEQ_JOINT)
             lock.objtype, lock.active = mujoco.mjtObj.mjOBJ_JOINT, False
             lock.data[0] = angle  # the joint angle that the lock holds
