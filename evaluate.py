@@ -239,14 +239,14 @@ def main(argv: list[str] | None = None) -> None:
     add("--pairs", action="store_true", help="matrix: of pairs of legs, not of single joints")
     add("--out", type=Path, default=Path("results"), help="folder of the CSV file and the picture")
     args = parser.parse_args(argv)
-    if args.experiment == "claims":
-        return claims(args.out)
-    function, task, robot, methods = EXPERIMENTS[args.experiment]
-    seconds = 10.0 if args.experiment in ("real_world", "gaits") else 20.0
-    args.robot, args.seconds = args.robot or robot, args.seconds or seconds
-    if args.episodes < 1 or args.threads < 1 or args.seconds < CONTROL_DT:
-        parser.error(f"there is at least one episode of {CONTROL_DT} s, and one thread")
     try:
+        if args.experiment == "claims":
+            return claims(args.out)
+        function, task, robot, methods = EXPERIMENTS[args.experiment]
+        seconds = 10.0 if args.experiment in ("real_world", "gaits") else 20.0
+        args.robot, args.seconds = args.robot or robot, args.seconds or seconds
+        if args.episodes < 1 or args.threads < 1 or args.seconds < CONTROL_DT:
+            parser.error(f"there is at least one episode of {CONTROL_DT} s, and one thread")
         args.task = task or first_task(args.robot)
         policies = find_policies(args, methods)
         args.out.mkdir(parents=True, exist_ok=True)
