@@ -52,7 +52,8 @@ def chart(panels: dict[str, dict], cases: list[str], picture: Path, title: str, 
                 places = np.arange(len(cases)) + (i - (len(methods) - 1) / 2) * width
                 errors = np.abs([means - lows, highs - means])
                 axis.bar(places, means, width, yerr=errors, label=method, error_kw={"lw": 0.8})
-                axis.set_xticks(range(len(cases)), [case.replace(" ", "\n") for case in cases])
+                words = [case.replace(" ", "\n").replace(":", ":\n") for case in cases]
+                axis.set_xticks(range(len(cases)), words)
             for place, (*_, seeds) in zip(places, cells):
                 axis.plot([place] * len(seeds), seeds, ".", color=f"C{i}", mec="k", mew=0.3)
         axis.set(ylabel=what, xlabel=x)

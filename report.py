@@ -178,6 +178,8 @@ CLAIMS = (
           ("RR", "RL")),
     Claim("... or with no sign of which leg is which, FL too (ours)", "stiffness", "success",
           ("no-identity",)),
+    Claim("walks with FL locked (added later: RESULTS.md)", "stiffness", "success",
+          (0.8, "module-pe", *UNSHARED), ("FL",)),
     Claim("stays up with motors it never saw dead", "damage", "upright", (0.95,)),
     Claim("... and gets on", "damage", "success", (0.8, "module-pe", *UNSHARED)),
     Claim("displaced patches cost it the least", "low_frequency", "kept", NOISE),
