@@ -240,7 +240,8 @@ def claims(folder: Path) -> None:
                 print(line + f"| | {other} | | | {', '.join(why)} | - |")
                 continue
             unseen = dict.fromkeys(row["case"] for row in rows if not int(row["seen"]))
-            cases = [x for x in claim.cases or unseen if all(uses(rows, m, x) for m in methods)]
+            cases = [case for case in claim.cases or unseen if case in unseen]
+            cases = [case for case in cases if all(uses(rows, m, case) for m in methods)]
             if not cases:
                 print(line + f"| | {other} | | | no leg that both use | - |")
                 continue
