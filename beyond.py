@@ -1,13 +1,4 @@
-"""What the paper does not ask. Run by evaluate.py, whose options count here, too.
-
-    python evaluate.py mechanisms         # is alive what the claims rest on?
-    python evaluate.py dropout_ratio      # why dropout has to be consistent
-    python evaluate.py curves             # learning curves
-    python evaluate.py growth --checkpoints runs/*/policy-*M.pt    # and what they knew on the way
-    python evaluate.py legs --checkpoints FILE ...    # how many legs must training harm?
-    python evaluate.py sudden             # a fault that strikes in mid-stride, and goes
-    python evaluate.py matrix [--pairs]   # every joint, five ways
-    python evaluate.py senses             # sensors that fail, motors that are late
+"""What the paper does not ask; experiments of evaluate.py like its own (their list is there).
 
 All on flat ground (mechanisms of stairs' policies: stairs), told to walk at 0.75 m/s.
 """
@@ -147,8 +138,8 @@ def curves(args, policies) -> None:
 
 
 def growth(args, policies) -> None:
-    """Success on what was never seen, against the steps of training. What growth.csv holds of other
-    runs stays in it: snapshots are too many to keep."""
+    """Success on what was never seen, against the steps of training, of --checkpoints
+    runs/*/policy-*M.pt. Other runs stay in growth.csv: snapshots are too many to keep."""
     rows = walk_cases(args, policies, {fault: fault for fault in TASKS[args.task].unseen}, SPEED)
     steps = {str(path): card["steps"] for path, (_, card) in policies.items()}
     for row in rows:

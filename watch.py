@@ -30,7 +30,7 @@ from ppo import to_tensors
 from robots import ROBOTS
 from rolt import ROLT
 from terrain import Terrain
-from walk import straight_ahead
+from walk import show_progress, straight_ahead
 
 HELP = "type a fault (lock:RL_calf, healthy), a speed (0.5), noise (sigma:0.1), again or quit"
 
@@ -52,7 +52,7 @@ class Show:
     def __init__(self, policy, robot: str, fault: str, speed: float, seed: int, terrain, noise):
         self.policy, self.robot, self.speed = policy, robot, speed
         self.seed, self.terrain = seed, terrain
-        self.words, self.said, self.over = queue.Queue(), HELP, False
+        self.words, self.said, self.over, self.fell = queue.Queue(), HELP, False, False
         self.terms, self.attention = {}, {}  # of the last step: rewards, and where legs look
         self.start(fault, noise)
 
@@ -140,8 +140,10 @@ def film(show: Show, out: Path, seconds: float) -> None:
     camera.distance = 1.3 * max(1.0, show.env.robot.trunk_box[0] / 0.38)  # m, the whole robot
     camera.elevation = -18
     camera.azimuth = 60 if show.terrain else 125  # from behind, stairs show their steps
-    for step in range(round((2 + seconds) / CONTROL_DT)):
+    began, steps = time.monotonic(), round((2 + seconds) / CONTROL_DT)
+    for step in range(steps):
         show.step()
+        show_progress("film", step + 1, steps, began)
         if show.fell:
             break
         if step * CONTROL_DT >= 2 and step % 2 == 0:
