@@ -3,7 +3,7 @@
     python evaluate.py stiffness    # every shipped checkpoint (or --checkpoints FILE ...)
     python evaluate.py gaits --methods rolt --episodes 8 --seconds 10 --out /tmp/quick
     python evaluate.py claims       # verdicts on the paper's claims, from the CSV files (report.py)
-    python evaluate.py watch        # a policy to look at while it walks (watch.py)
+    python evaluate.py watch        # one walks on a screen, in a page or a film (watch.py)
 
 Each prints a table and writes EXPERIMENT.csv (mostly a row an episode) and EXPERIMENT.png to --out.
 A cell is the mean over the seeds of a method (checkpoints/NAME.pt, NAME-seed1.pt, ...) and over the
@@ -193,6 +193,7 @@ EXPERIMENTS = {
     "senses": (beyond.senses, None, "a1", METHODS),
     "mechanisms": (beyond.mechanisms, None, "a1", METHODS),
     "dropout_ratio": (beyond.dropout_ratio, "stiffness", "a1", ("rolt",)),
+    "watch": (watch.watch, None, "a1", ("rolt",)),
 }
 
 
@@ -221,9 +222,6 @@ def find_policies(args, methods) -> dict[Path, tuple]:
 
 
 def main(argv: list[str] | None = None) -> None:
-    words = sys.argv[1:] if argv is None else argv
-    if words[:1] == ["watch"]:
-        return watch.main(words[1:])
     plain = {"usage": argparse.SUPPRESS, "formatter_class": argparse.RawDescriptionHelpFormatter}
     parser = argparse.ArgumentParser(description=__doc__, **plain)
     add = parser.add_argument
@@ -233,24 +231,36 @@ def main(argv: list[str] | None = None) -> None:
     which("--methods", nargs="+", choices=METHODS, help="of the shipped policies (default: all)")
     which("--checkpoints", nargs="+", type=Path, metavar="FILE", help="instead of the shipped ones")
     add("--episodes", type=int, default=32, help="a case (default 32)")
-    add("--seconds", type=float, help="an episode (default: the paper's 20; real_world, gaits 10)")
+    add("--seconds", type=float, help="an episode (default 20; real_world, gaits 10; films 4)")
     add("--seed", type=int, default=0, help="of the starts")
     add("--threads", type=int, default=os.cpu_count(), help="cores to use (default: all)")
     add("--pairs", action="store_true", help="matrix: of pairs of legs, not of single joints")
     add("--out", type=Path, default=Path("results"), help="folder of the CSV file and the picture")
+    add = parser.add_argument_group("watch").add_argument
+    add("--fault", default=HEALTHY, help="for example lock:FR_calf+weaken:RL:0.5 (faults.py)")
+    add("--speed", type=float, default=0.75, help="commanded, m/s (default 0.75)")
+    add("--stairs", type=int, choices=range(-2, 11), help="level of the steps (default: flat)")
+    add("--noise", default="clean", help="on the scandots: offset:0.2, sigma:0.1, missing:4")
+    add("--film", type=Path, metavar="FILE.gif", help="instead of a viewer")
+    add("--public", action="store_true", help="a page, for all who can reach this machine's port")
+    add("--port", type=int, default=0, help="of the page (default: the first free from 8080)")
     args = parser.parse_args(argv)
     try:
         if args.experiment == "claims":
             return claims(args.out)
         function, task, robot, methods = EXPERIMENTS[args.experiment]
-        seconds = 10.0 if args.experiment in ("real_world", "gaits") else 20.0
+        seconds = {"real_world": 10.0, "gaits": 10.0, "watch": 4.0}.get(args.experiment, 20.0)
         args.robot, args.seconds = args.robot or robot, args.seconds or seconds
         if args.episodes < 1 or args.threads < 1 or args.seconds < CONTROL_DT:
             parser.error(f"there is at least one episode of {CONTROL_DT} s, and one thread")
         args.task = task or first_task(args.robot)
+        if args.stairs is not None:
+            args.task = "terrain"
         policies = find_policies(args, methods)
-        args.out.mkdir(parents=True, exist_ok=True)
         torch.set_num_threads(args.threads)
+        if args.experiment == "watch":
+            return function(args, policies)
+        args.out.mkdir(parents=True, exist_ok=True)
         with torch.no_grad():
             function(args, policies)
         print(f"\nwritten: {args.out / args.experiment}.*")

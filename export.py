@@ -1,7 +1,7 @@
 """Takes a policy away: a program for torch.export, the robot's model, and a contract in words.
 
     python export.py checkpoints/a1-stiffness-rolt.pt exported
-    python deploy.py exported      # walks, with MuJoCo, numpy and torch alone
+    python examples/deploy.py exported    # walks, with MuJoCo, numpy and torch alone
 
 OUT gets policy.pt2 (actions from inputs, any number of robots), robot.mjb (MuJoCo's model) and
 policy.json (order, meaning and scale of every input and of the actions). What the program answers
@@ -17,26 +17,14 @@ import mujoco
 import torch
 from torch import nn
 
+import env
+import noise
 from baselines import ROAM
 from checkpoint import load_policy
-from env import JOINT_SCALE, LONG_HISTORY, MAX_ACTION, TRUNK_SCALE, EnvConfig, LocomotionEnv
-from noise import HEIGHT_SCALE, SPACING, TRUNK_HEIGHT
+from env import JOINT_SCALE, MAX_ACTION, TRUNK_SCALE, EnvConfig, LocomotionEnv
 from ppo import to_tensors
 from robots import CONTROL_DT, PHYSICS_DT
-from rolt import HISTORY, SCAN_SHAPE, Observation
-
-FRAME = "for each step, oldest first, and leg: joint angles beyond default_pose [rad], velocities \
-[rad/s], previous action; command: forward, left [m/s], yaw [rad/s]; trunk's linear velocity \
-[m/s], angular velocity [rad/s] and direction of gravity less (0, 0, -1), in the trunk's frame. \
-Signs: joint_sign on angles and velocities, trunk_sign on the last twelve; scales: joint_scale \
-(angle, velocity, action), trunk_scale. At the start every step is the first"
-MEANING = {
-    "legs": FRAME,
-    "action": "the previous actions, leg by leg",
-    "heights": f"{HEIGHT_SCALE:g} clip(trunk z - {TRUNK_HEIGHT} m - ground z, -1, 1) on a level "
-    f"grid around the trunk, turning with it, {SPACING} m apart; from rear to front, right to left",
-    "past": f"as legs, {LONG_HISTORY} steps",
-}
+from rolt import Observation
 
 
 class Plain(nn.Module):
@@ -51,23 +39,22 @@ class Plain(nn.Module):
         return self.policy(Observation(**fields | dict(zip(self.names, inputs))))
 
 
-def contract(card: dict, env: LocomotionEnv, inputs: dict[str, torch.Tensor]) -> dict:
+def contract(card: dict, world: LocomotionEnv, inputs: dict[str, torch.Tensor]) -> dict:
     """All that who calls the program has to know."""
-    robot = env.robot
     keys = "stiffness", "damping", "action_scale", "default_pose", "legs", "joints"
-    told = {key: card[key] for key in ("robot", "task", "policy", "seed", "steps")}
-    told |= {key: getattr(robot, key) for key in keys}
-    told |= {"control_dt": CONTROL_DT, "physics_dt": PHYSICS_DT, "max_action": MAX_ACTION}
-    told |= {"history": HISTORY, "scandots": SCAN_SHAPE, "trunk_scale": TRUNK_SCALE.tolist()}
-    told |= {"joint_scale": JOINT_SCALE.ravel().tolist(), "joint_sign": env._joint_sign.tolist()}
-    told["trunk_sign"] = env._trunk_sign.tolist()
-    told["inputs"] = [
-        {"name": name, "shape": ["robots", *x.shape[1:]], "meaning": MEANING[name]}
-        for name, x in inputs.items()
-    ]
-    told["output"] = "actions, leg by leg; whoever applies them clips them to +-max_action; joint "
-    told["output"] += "target [rad] = default_pose + action_scale * joint_sign * action"
-    return told
+    return {
+        **{key: card[key] for key in ("robot", "task", "policy", "seed", "steps")},
+        **{key: getattr(world.robot, key) for key in keys},
+        "control_dt": CONTROL_DT, "physics_dt": PHYSICS_DT, "max_action": MAX_ACTION,
+        "joint_scale": JOINT_SCALE.ravel().tolist(), "trunk_scale": TRUNK_SCALE.tolist(),
+        "joint_sign": world._joint_sign.tolist(), "trunk_sign": world._trunk_sign.tolist(),
+        "inputs": {name: ["robots", *x.shape[1:]] for name, x in inputs.items()},
+        "leg frames": "joint_sign times angles and velocities, trunk_sign times the last twelve; "
+        "at the start all steps of the history are the first",
+        "output": "actions, leg by leg; whoever applies them clips them to +-max_action; joint "
+        "target [rad] = default_pose + action_scale * joint_sign * action",
+        "about the inputs": [*env.__doc__.splitlines(), *noise.__doc__.splitlines()],
+    }  # fmt: skip
 
 
 def export(path: Path, out: Path) -> None:
@@ -75,8 +62,8 @@ def export(path: Path, out: Path) -> None:
     if isinstance(policy, ROAM):
         raise ValueError("ROAM draws its behaviour at random, which no program can repeat")
     config = EnvConfig(leg_frames=policy.leg_frames)
-    env = LocomotionEnv(card["robot"], 3, num_threads=1, config=config, extras=policy.extras)
-    observation = to_tensors(env.reset(), "cpu")
+    world = LocomotionEnv(card["robot"], 3, num_threads=1, config=config, extras=policy.extras)
+    observation = to_tensors(world.reset(), "cpu")
     inputs = {x: getattr(observation, x) for x in ("legs", "action", *policy.extras)}
 
     plain = Plain(policy, [*inputs]).eval()
@@ -85,8 +72,8 @@ def export(path: Path, out: Path) -> None:
     program = torch.export.export(plain, tuple(inputs.values()), dynamic_shapes=shapes)
     out.mkdir(parents=True, exist_ok=True)
     torch.export.save(program, out / "policy.pt2")
-    mujoco.mj_saveModel(env.model, str(out / "robot.mjb"))
-    (out / "policy.json").write_text(json.dumps(contract(card, env, inputs), indent=1))
+    mujoco.mj_saveModel(world.model, str(out / "robot.mjb"))
+    (out / "policy.json").write_text(json.dumps(contract(card, world, inputs), indent=1))
 
     again, states = torch.export.load(out / "policy.pt2").module(), 0
     for _ in range(50):
@@ -95,7 +82,7 @@ def export(path: Path, out: Path) -> None:
         if not torch.equal(answer, action):
             gap = (answer - action).abs().max()
             raise RuntimeError(f"the program's actions differ from the policy's by {gap}")
-        observation, states = to_tensors(env.step(action.numpy())[0], "cpu"), states + len(action)
+        observation, states = to_tensors(world.step(action.numpy())[0], "cpu"), states + len(action)
     print(f"written: {out}/policy.pt2, policy.json, robot.mjb; equal to the bit in {states} states")
 
 

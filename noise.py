@@ -1,9 +1,9 @@
 """Scandots: the 16 x 12 points around the robot at which it is told the height of the ground; and
 what can be wrong with them in tests (section IV-B of the paper; for training: baselines.py).
 
-The grid lies level, turns with the robot's yaw and has its trunk in the middle; row 0 is rearmost,
-column 0 rightmost. Transformers read it as 4 x 3 patches (12: paper) of 4 x 4 points (ours), row by
-row. Noise shifts points, vertically and in where the ground is read (beside edges). n robots.
+The grid lies level, 0.1 m a step, turns with the robot's yaw and has its trunk in the middle; row 0
+is rearmost, column 0 rightmost. Transformers read it as 4 x 3 patches (12: paper) of 4 x 4 points
+(ours), row by row. Noise shifts points, vertically and in where the ground is read (beside edges).
 """
 
 from dataclasses import astuple, dataclass

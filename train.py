@@ -190,8 +190,8 @@ def train(rank: int, args, sync: str) -> None:
             content = options | {"steps": steps, "stages": lengths, "options": options}
             content |= {name: part.state_dict() for name, part in run.parts.items()}
             content |= {"stage": run.number, "iteration": iteration, "processes": everyone}
-            content |= {"torch": torch.get_rng_state(), "rows": progress.rows}
-            content["curve"] = progress.curve()
+            curve = [[float(row[name]) for name in checkpoint.CURVE] for row in rows[::10]]
+            content |= {"torch": torch.get_rng_state(), "rows": rows, "curve": torch.tensor(curve)}
             checkpoint.save(content, args.out / "checkpoint.pt")
             checkpoint.save_policy(content, args.out / "policy.pt")
             if snapshot:  # to see how a policy grew
@@ -199,9 +199,11 @@ def train(rank: int, args, sync: str) -> None:
             curves = {args.policy: [content["curve"].numpy()]}
             learning_curves(curves, args.out / "progress.png", args.out.name)
 
-    if rank == 0:
-        progress = Progress(args.out / "progress.csv", saved.get("rows", []), ends[-1])
-    saved_at, stop = time.monotonic(), False
+    rows = saved.get("rows", [])  # of progress.csv; later ones of an earlier try are dropped
+    if rank == 0 and rows:
+        write_csv(args.out / "progress.csv", rows)
+    began = saved_at = time.monotonic()
+    stop = False
     while steps < ends[-1] and not stop:
         if steps >= ends[run.number + 1]:
             i = run.number + 1
@@ -226,7 +228,8 @@ def train(rank: int, args, sync: str) -> None:
             row = {"iteration": iteration, "steps": steps, "stage": run.number} | figures
             row |= dict.fromkeys(LOSSES, math.nan) | losses | {"std": run.actor.std().mean().item()}
             row |= {"collect_seconds": collected - started, "update_seconds": updated - collected}
-            progress.log(row)
+            rate = (steps - saved["steps"]) / (time.monotonic() - began)
+            log(row, rows, args.out / "progress.csv", ends[-1], rate)
         snapshot = steps * 5 // ends[1] > fifths
         if due or stop or snapshot or steps >= ends[-1]:
             save(snapshot)
@@ -257,44 +260,29 @@ def summarise(infos: list[dict], buffer: RolloutBuffer, env: LocomotionEnv) -> d
     return figures | {"episodes": len(returns), "returns": returns.sum(), "lengths": lengths.sum()}
 
 
-class Progress:
-    """One CSV row an iteration, and the live line."""
+def log(row: dict, rows: list[dict], path: Path, total: int, rate: float) -> None:
+    """Adds an iteration's row, and what the episodes of the last 20 were like, to `rows` and to the
+    CSV file, and shows it. total: steps of the run; rate: steps a second."""
+    names, last = ("episodes", "returns", "lengths", "falls"), rows[-19:] + [row]
+    episodes, *sums = (sum(float(row[name]) for row in last) for name in names)
+    returns, lengths, falls = (x / episodes if episodes else math.nan for x in sums)
+    row |= {"episode_return": returns, "episode_seconds": lengths * CONTROL_DT}
+    row |= {"fall_share": falls}
+    rows.append({k: f"{x:.6g}" if isinstance(x, float) else x for k, x in row.items()})
+    write_csv(path, rows[-1:], "a" if len(rows) > 1 else "w")
 
-    def __init__(self, path: Path, rows: list[dict], total: int):
-        """rows: of the iterations up to the checkpoint that a run goes on from."""
-        self.path, self.rows, self.total, self.start = path, rows, total, time.monotonic()
-        self.first = rows[-1]["steps"] if rows else 0
-        if rows:
-            write_csv(path, rows)  # later ones of an earlier try are dropped
-
-    def curve(self) -> torch.Tensor:
-        """(n, len(CURVE)), the first and every tenth iteration."""
-        rows = [[float(row[name]) for name in checkpoint.CURVE] for row in self.rows[::10]]
-        return torch.tensor(rows)
-
-    def log(self, row: dict) -> None:
-        """Adds to the row what the episodes of the last iterations were like, and writes it."""
-        names, last = ("episodes", "returns", "lengths", "falls"), self.rows[-19:] + [row]
-        episodes, *sums = (sum(float(row[name]) for row in last) for name in names)
-        returns, lengths, falls = (x / episodes if episodes else math.nan for x in sums)
-        row |= {"episode_return": returns, "episode_seconds": lengths * CONTROL_DT}
-        row |= {"fall_share": falls}
-        self.rows.append({k: f"{x:.6g}" if isinstance(x, float) else x for k, x in row.items()})
-        write_csv(self.path, self.rows[-1:], "a" if len(self.rows) > 1 else "w")
-
-        steps, total = row["steps"], self.total
-        rate = (steps - self.first) / (time.monotonic() - self.start)
-        line = (
-            f"[{'#' * int(20 * steps / total):.<20.20}] {steps / 1e6:.2f}/{total / 1e6:.2f}M"
-            f" {rate:,.0f}/s {max(0, total - steps) / rate / 60:.0f} min left"
-            f" | speed {row['speed']:.2f} of {row['commanded_speed']:.2f} m/s std {row['std']:.2f}"
-        )
-        if episodes:
-            line += f" return {returns:.1f} falls {falls:.0%} after {row['episode_seconds']:.1f} s"
-        if sys.stdout.isatty():
-            print(f"\r{line}\033[K", end="", flush=True)
-        elif row["iteration"] % 10 == 1:  # not to fill a log
-            print(line, flush=True)
+    steps = row["steps"]
+    line = (
+        f"[{'#' * int(20 * steps / total):.<20.20}] {steps / 1e6:.2f}/{total / 1e6:.2f}M"
+        f" {rate:,.0f}/s {max(0, total - steps) / rate / 60:.0f} min left"
+        f" | speed {row['speed']:.2f} of {row['commanded_speed']:.2f} m/s std {row['std']:.2f}"
+    )
+    if episodes:
+        line += f" return {returns:.1f} falls {falls:.0%} after {row['episode_seconds']:.1f} s"
+    if sys.stdout.isatty():
+        print(f"\r{line}\033[K", end="", flush=True)
+    elif row["iteration"] % 10 == 1:  # not to fill a log
+        print(line, flush=True)
 
 
 def guarded(rank: int, args, sync: str) -> None:

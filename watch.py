@@ -2,14 +2,13 @@
 
     python evaluate.py watch --fault lock:FR_calf --speed 0.5
     python evaluate.py watch --stairs 0 --noise offset:0.2    # steps of 5 cm, scandots that lie
-    python evaluate.py watch --fault tow:RR --out tow.gif     # no viewer, a moving picture
+    python evaluate.py watch --fault tow:RR --film tow.gif    # no viewer, a moving picture
 
 Where there is a display, a window opens, with a panel for speed and faults. --public makes it a
 page for the browser, which MuJoCo serves to all who can reach the port, with all that the panel
 does. The terminal takes words, too. A robot that falls starts over.
 """
 
-import argparse
 import copy
 import os
 import queue
@@ -23,11 +22,9 @@ import numpy as np
 import torch
 from PIL import Image
 
-from checkpoint import load_policy
 from env import CONTROL_DT, LocomotionEnv
 from faults import REAL_WORLD, TASKS, faulty_model, first_task, harms_of, props
 from ppo import to_tensors
-from robots import ROBOTS
 from rolt import ROLT
 from terrain import Terrain
 from walk import show_progress, straight_ahead
@@ -134,7 +131,7 @@ def film(show: Show, out: Path, seconds: float) -> None:
         renderer = mujoco.Renderer(model, height=300, width=480)
     except Exception as error:  # each backend fails in its own way
         way_out = "install libegl1, or try MUJOCO_GL=glfw (a display) or osmesa (libosmesa6)"
-        raise RuntimeError(f"cannot draw ({error}): {way_out}") from error
+        raise OSError(f"cannot draw ({error}): {way_out}") from error
 
     camera, frames = mujoco.MjvCamera(), []
     camera.distance = 1.3 * max(1.0, show.env.robot.trunk_box[0] / 0.38)  # m, the whole robot
@@ -153,7 +150,7 @@ def film(show: Show, out: Path, seconds: float) -> None:
             renderer.update_scene(show.data, camera)
             frames.append(Image.fromarray(renderer.render()))
     if not frames:
-        raise RuntimeError(f"with {show.fault} the robot falls within 2 s: nothing to show")
+        raise ValueError(f"with {show.fault} the robot falls within 2 s: nothing to show")
     # one palette for all frames keeps the file small and the colours still, a fault's red too
     some = Image.fromarray(np.vstack([np.array(frame) for frame in frames[::10]]))
     palette = some.quantize(64, Image.Quantize.FASTOCTREE)
@@ -227,47 +224,23 @@ def view(show: Show, public: bool, port: int) -> None:
             time.sleep(max(0.0, due - time.monotonic()))
 
 
-def main(argv: list[str] | None = None) -> None:
-    plain = {"usage": argparse.SUPPRESS, "formatter_class": argparse.RawDescriptionHelpFormatter}
-    parser = argparse.ArgumentParser(description=__doc__, **plain)
-    add, levels = parser.add_argument, range(-2, 11)
-    add("--robot", default="a1", choices=ROBOTS)
-    add("--checkpoint", type=Path, metavar="FILE", help="default: the shipped ROLT of the robot")
-    add("--fault", default="healthy", help="for example lock:FR_calf+weaken:RL:0.5")
-    add("--speed", type=float, default=0.75, help="commanded, m/s (default 0.75)")
-    add("--stairs", type=int, choices=levels, metavar="LEVEL", help="-2 to 10 (default: flat)")
-    add("--noise", default="clean", help="on the scandots: offset:0.2, sigma:0.1, missing:4")
-    add("--seed", type=int, default=0)
-    add("--public", action="store_true", help="a page, for all who can reach this machine's port")
-    add("--port", type=int, default=0, help="of the page (default: the first free from 8080)")
-    add("--out", type=Path, metavar="FILE.gif", help="write a film instead")
-    add("--seconds", type=float, default=4.0, help="of the film (default 4)")
-    args = parser.parse_args(argv)
-    if args.out and args.out.suffix != ".gif":
-        parser.error(f"--out is a .gif file, not {args.out}")
+def watch(args, policies) -> None:
+    """The first of the policies, until the viewer is closed; or a film."""
     display = sys.platform != "linux" or os.getenv("DISPLAY") or os.getenv("WAYLAND_DISPLAY")
-    if not (display or args.out or args.public):
+    if args.film and args.film.suffix != ".gif":
+        raise ValueError(f"--film is a .gif file, not {args.film}")
+    if not (display or args.film or args.public):
         page = "--public a page that all can open who reach this machine"
-        parser.error(f"there is no display: --out walk.gif writes a film, {page}")
+        raise ValueError(f"there is no display: --film walk.gif writes a film, {page}")
     torch.set_num_threads(1)
+    (policy, _), *_ = policies.values()
+    terrain = None if args.stairs is None else Terrain(("stairs",), (args.stairs,) * 9)
+    show = Show(policy, args.robot, args.fault, args.speed, args.seed, terrain, args.noise)
+    if args.film:
+        return film(show, args.film, args.seconds)
+    print(HELP)
+    threading.Thread(target=listen, args=(show,), daemon=True).start()
     try:
-        task = first_task(args.robot) if args.stairs is None else "terrain"
-        shipped = Path(__file__).parent / f"checkpoints/{args.robot}-{task}-rolt.pt"
-        policy, _ = load_policy(args.checkpoint or os.path.relpath(shipped), args.robot)
-        terrain = None if args.stairs is None else Terrain(("stairs",), (args.stairs,) * 9)
-        show = Show(policy, args.robot, args.fault, args.speed, args.seed, terrain, args.noise)
-        if args.out:
-            return film(show, args.out, args.seconds)
-        print(HELP)
-        threading.Thread(target=listen, args=(show,), daemon=True).start()
         view(show, args.public, args.port)
-    except KeyboardInterrupt:
-        pass
-    except (ValueError, RuntimeError, ImportError, OSError, ArithmeticError) as error:
-        if sys.flags.dev_mode:
-            raise
-        sys.exit(f"error: {error}")
-
-
-if __name__ == "__main__":
-    main()
+    except (RuntimeError, ImportError) as error:
+        raise OSError(f"no viewer ({error}): --film writes a film") from error

@@ -294,4 +294,4 @@ def test_reward_terms_by_hand_scaled_by_time_and_floored_and_standing_earns_no_a
     reward, terms = rewards.total_reward(good, 0.02)
     assert reward[0] == pytest.approx(0.02 * sum(t[0] for t in terms.values())) and reward[0] > 0
     still = SimpleNamespace(**(vars(BY_HAND) | {"command": np.array([[0.0, 0.05, 0.9]])}))
-    assert rewards.foot_air_time(still)[0] == 0.0
+    assert rewards.total_reward(still, 0.02)[1]["foot_air_time"][0] == 0.0

@@ -18,7 +18,7 @@ def test_the_shipped_policy_walks_on_plain_mujoco(tmp_path, capsys):
     export.main([str(ROOT / "checkpoints" / "a1-stiffness-rolt.pt"), str(tmp_path)])
     assert "equal to the bit in 150 states" in capsys.readouterr().out
     script = tmp_path / "deploy.py"
-    script.write_text((ROOT / "deploy.py").read_text())  # alone, in another place
+    script.write_text((ROOT / "examples" / "deploy.py").read_text())  # alone, in another place
     command = [sys.executable, "-I", str(script), str(tmp_path)]
     done = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
@@ -31,14 +31,15 @@ def test_policies_with_a_scan_or_a_long_memory_can_go_too(tmp_path):
         file = save_policy(tmp_path / "p.pt", policy=policy, task="terrain", scan=True)
         export.main([file, str(tmp_path / policy)])
         card = json.loads((tmp_path / policy / "policy.json").read_text())
-        assert [x["name"] for x in card["inputs"]] == ["legs", "action", *names]
+        assert [*card["inputs"]] == ["legs", "action", *names]
         program = torch.export.load(tmp_path / policy / "policy.pt2").module()
-        inputs = [torch.zeros(7, *x["shape"][1:]) for x in card["inputs"]]
+        inputs = [torch.zeros(7, *shape[1:]) for shape in card["inputs"].values()]
         assert program(*inputs).shape == (7, 12)
 
 
 def test_the_vector_env_keeps_gymnasiums_contract():
     checker = pytest.importorskip("gymnasium.utils.env_checker")
+    sys.path.append(str(ROOT / "examples"))
     from vector_env import WalkingRobots
 
     envs = WalkingRobots("a1", 4, num_threads=1, config=EnvConfig(episode_seconds=0.2))

@@ -14,7 +14,6 @@ import checkpoint
 import evaluate
 import export
 import train
-import watch
 from baselines import make_policy
 from conftest import ROOT, env_of, save_policy
 from faults import STIFF, TASKS
@@ -217,8 +216,9 @@ def test_all_shipped_seeds_are_put_together(tmp_path, monkeypatch):
     (evaluate, ["stiffness", "--checkpoints", "misfit.pt"], "does not fit"),
     (evaluate, ["stiffness", "--methods", "mlp", "--checkpoints", "good.pt"], "not allowed"),
     (evaluate, ["stiffness", "--checkpoints", "good.pt", "./good.pt", "same.pt"], "the same"),
-    (watch, ["--checkpoint", "good.pt", "--out", "a.gif", "--fault", "melt:FR"], "lock:FR"),
-    (watch, ["--checkpoint", "good.pt", "--out", "walk.mp4"], "is a .gif"),
+    (evaluate, ["watch", "--checkpoints", "good.pt", "--film", "walk.mp4"], "is a .gif"),
+    (evaluate, ["watch", "--checkpoints", "good.pt", "--film", "a.gif", "--fault", "melt:FR"],
+     "lock:FR"),
     (export, ["roam.pt", "exported"], "ROAM draws its behaviour"),
 ])  # fmt: skip
 def test_wrong_input_ends_in_one_line(script, words, says, tmp_path, capsys, monkeypatch):

@@ -59,8 +59,9 @@ def test_films_are_written_without_a_display(tmp_path, monkeypatch):
     """Or with one that is gone. Where nothing can be drawn, the script must say so in one line."""
     monkeypatch.delenv("MUJOCO_GL", raising=False)
     monkeypatch.setenv("DISPLAY", ":99")
-    words = [sys.executable, ROOT / "watch.py", "--fault", "lock:FL_calf", "--seconds", "0.4"]
-    words += ["--checkpoint", save_policy(tmp_path / "policy.pt"), "--out", "one.gif"]
+    words = [sys.executable, ROOT / "evaluate.py", "watch", "--fault", "lock:FL_calf"]
+    words += ["--checkpoints", save_policy(tmp_path / "policy.pt"), "--film", "one.gif"]
+    words += ["--seconds", "0.4"]
     one = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True)
     if one.returncode:
         assert "MUJOCO_GL" in one.stderr and one.stderr.count("\n") == 1

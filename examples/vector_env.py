@@ -1,4 +1,5 @@
-"""The env as a Gymnasium vector env, for who brings a library of their own (pip install gymnasium).
+"""The env as a Gymnasium vector env, for who brings a library of their own (pip install gymnasium;
+PYTHONPATH is this repository's folder).
 
     envs = WalkingRobots("a1", 64, faults=[(0.5, "healthy"), (0.5, "lock:FR_calf")])
     observation, info = envs.reset(seed=0)

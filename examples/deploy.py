@@ -1,6 +1,6 @@
 """An exported policy (export.py) walks 10 s: MuJoCo, numpy and torch, nothing of this repository.
 
-    python deploy.py exported
+    python examples/deploy.py exported
 """
 
 import json
@@ -19,7 +19,7 @@ policy = torch.export.load(folder / "policy.pt2").module()
 model = mujoco.MjModel.from_binary_path(str(folder / "robot.mjb"))
 names = "default_pose", "joint_sign", "trunk_sign", "joint_scale", "trunk_scale"
 default, joint_sign, trunk_sign, joint_scale, trunk_scale = (np.array(card[x]) for x in names)
-if [x["name"] for x in card["inputs"]] != ["legs", "action"]:
+if [*card["inputs"]] != ["legs", "action"]:
     sys.exit("error: this example walks blind, and the policy reads more than legs and action")
 
 data, action, history = mujoco.MjData(model), np.zeros_like(default), None
@@ -35,7 +35,7 @@ for _ in range(round(10 / card["control_dt"])):
     trunk = trunk_sign * trunk_scale * np.concatenate([*trunk, -rotation[2] - (0, 0, -1)])
     frame = np.concatenate([(joint_scale[:, None] * joints).reshape(len(trunk), -1), trunk], axis=1)
     if history is None:
-        history = np.repeat(frame[:, None], card["history"], axis=1)
+        history = np.repeat(frame[:, None], card["inputs"]["legs"][2], axis=1)
     history = np.concatenate([history[:, 1:], frame[:, None]], axis=1)
 
     inputs = (torch.tensor(x[None], dtype=torch.float32) for x in (history, action.ravel()))
