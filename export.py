@@ -42,6 +42,7 @@ class Plain(nn.Module):
 def contract(card: dict, world: LocomotionEnv, inputs: dict[str, torch.Tensor]) -> dict:
     """All that who calls the program has to know."""
     keys = "stiffness", "damping", "action_scale", "default_pose", "legs", "joints"
+    about = env.__doc__.partition("What rewards")[0] + noise.__doc__
     return {
         **{key: card[key] for key in ("robot", "task", "policy", "seed", "steps")},
         **{key: getattr(world.robot, key) for key in keys},
@@ -53,7 +54,7 @@ def contract(card: dict, world: LocomotionEnv, inputs: dict[str, torch.Tensor]) 
         "at the start all steps of the history are the first",
         "output": "actions, leg by leg; whoever applies them clips them to +-max_action; joint "
         "target [rad] = default_pose + action_scale * joint_sign * action",
-        "about the inputs": [*env.__doc__.splitlines(), *noise.__doc__.splitlines()],
+        "about the inputs": about.splitlines(),
     }  # fmt: skip
 
 

@@ -6,8 +6,10 @@ import numpy as np
 from matplotlib import colormaps, cycler, rcParams
 from matplotlib.figure import Figure
 
-COLOURS = colormaps["tab20"].colors
-rcParams["axes.prop_cycle"] = cycler(color=COLOURS[::2] + COLOURS[1::2])  # ten dark, ten light
+from baselines import METHODS
+
+TAB20 = colormaps["tab20"].colors  # ten dark ones, black for ROLT, the last method, ten light ones
+rcParams["axes.prop_cycle"] = cycler(color=[*TAB20[::2], "black", *TAB20[1::2]])
 rcParams.update({"font.size": 8, "axes.titlesize": 8, "legend.frameon": False})
 
 
@@ -18,6 +20,12 @@ def grid_of_axes(rows: int, columns: int, width: float, height: float, title: st
     return figure, figure.subplots(rows, columns, squeeze=False)
 
 
+def colour_of(name: str, i: int) -> str:
+    """A method's, the same in all charts; else that of the i-th."""
+    method = name.split(",")[0]  # "mlp, not trained"
+    return f"C{[*METHODS].index(method) if method in METHODS else i}"
+
+
 def learning_curves(methods: dict[str, list], picture: Path, title: str) -> None:
     """methods: {name: a (n, len(CURVE)) array a seed}. A line is the mean of the seeds, a band what
     lies between the lowest and the highest."""
@@ -26,12 +34,13 @@ def learning_curves(methods: dict[str, list], picture: Path, title: str) -> None
     for axis, name in zip(axes[0], names):
         axis.set(title=name, xlabel="env steps [million]")
         axis.grid(alpha=0.3)
-    for method, seeds in methods.items():
-        length = min(map(len, seeds))
+    for i, (method, seeds) in enumerate(methods.items()):
+        length, colour = min(map(len, seeds)), colour_of(method, i)
         steps, returns, speed, command, falls = np.array([seed[:length] for seed in seeds]).T
         for axis, values in zip(axes[0], (returns, speed / command, falls)):
-            axis.plot(steps[:, 0] / 1e6, values.mean(axis=1), lw=1.2, label=method)
-            axis.fill_between(steps[:, 0] / 1e6, values.min(axis=1), values.max(axis=1), alpha=0.2)
+            x = steps[:, 0] / 1e6
+            axis.plot(x, values.mean(axis=1), lw=1.2, label=method, color=colour)
+            axis.fill_between(x, values.min(axis=1), values.max(axis=1), alpha=0.2, color=colour)
     figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=6)
     figure.savefig(picture)
 
@@ -44,18 +53,20 @@ def chart(panels: dict[str, dict], cases: list[str], picture: Path, title: str, 
         width = 0.8 / len(methods)
         for i, (method, cells) in enumerate(methods.items()):
             means, lows, highs = np.array([cell[:3] for cell in cells]).T
+            colour = colour_of(method, i)
             if x:
                 places = np.array(cases, dtype=float)
-                axis.plot(places, means, label=method)
-                axis.fill_between(places, lows, highs, alpha=0.12)
+                axis.plot(places, means, label=method, color=colour)
+                axis.fill_between(places, lows, highs, alpha=0.12, color=colour, lw=0)
             else:
                 places = np.arange(len(cases)) + (i - (len(methods) - 1) / 2) * width
                 errors = np.abs([means - lows, highs - means])
-                axis.bar(places, means, width, yerr=errors, label=method, error_kw={"lw": 0.8})
+                axis.bar(places, means, width, label=method, color=colour)
+                axis.errorbar(places, means, errors, fmt="none", ecolor="grey", elinewidth=0.8)
                 words = [case.replace(" ", "\n").replace(":", ":\n") for case in cases]
                 axis.set_xticks(range(len(cases)), words)
             for place, (*_, seeds) in zip(places, cells):
-                axis.plot([place] * len(seeds), seeds, ".", color=f"C{i}", mec="k", mew=0.3)
+                axis.plot([place] * len(seeds), seeds, "o", ms=3, mfc="w", mec=colour, mew=0.8)
         axis.set(ylabel=what, xlabel=x)
         axis.grid(axis="y", alpha=0.3)
     handles = axes[0, 0].get_legend_handles_labels()
