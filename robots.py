@@ -19,8 +19,6 @@ from dataclasses import dataclass, replace
 import mujoco
 import numpy as np
 
-from terrain import Terrain
-
 PHYSICS_DT = 0.005  # s, legged_gym: 200 Hz physics
 SUBSTEPS = 4  # legged_gym: 50 Hz control
 CONTROL_DT = SUBSTEPS * PHYSICS_DT  # s
@@ -112,12 +110,12 @@ class Robot:
 
 
 def build_model(
-    robot: Robot, terrain: Terrain | None = None,
+    robot: Robot, terrain=None,
     towing: Names = (), skating: Names = (), late: bool = False,
 ) -> mujoco.MjModel:  # fmt: skip
     """Keyframe 0 is the default pose; bodies and actuators are in the order of `robot.joints`. The
     sensors `contact_<geom>` count contacts, which are with the ground alone: the trunk's, then leg
-    by leg those of each link with a capsule and of the foot.
+    by leg those of each link with a capsule and of the foot. terrain: a terrain.Terrain or None.
 
     towing, skating: legs whose foot gets a tether to one box, or becomes a wheel; slack or braked
     until faults.py changes it. Both add bodies and joints: find a robot's own by name. late: motors
