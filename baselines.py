@@ -1,8 +1,8 @@
 """The methods that ROLT is compared with (paper, section IV); the list of them all is at the end.
 
 A policy is a module with forward(observation, masks) -> (B, A) mean action, std() -> (A,),
-sample_masks(n, generator) -> {name: (n, ...) bool}, and a few words on itself (`extras` and what
-follows in ROLT). How it is trained is a list of `Stage`s: most have one.
+sample_masks(n, generator) -> {name: (n, ...) masks or noise}, and a few words on itself (`extras`
+and what follows in ROLT). How it is trained is a list of `Stage`s: most have one.
 
 Legend: B samples, L legs, J joints a leg, A = L*J actions, K training situations.
 """
@@ -16,8 +16,9 @@ from faults import Task, other_harms
 from noise import HEIGHT_SCALE
 from ppo import Learner, PPOConfig, network, proprioception
 from robots import Robot
-from rolt import HISTORY, LOG_STD_BOUNDS, ROLT, SCAN_SHAPE, Decoder, Masks, Observation
-from rolt import ROLTConfig, drop
+from rolt import (
+    HISTORY, LOG_STD_BOUNDS, ROLT, SCAN_SHAPE, Decoder, Masks, Observation, ROLTConfig, drop,
+)  # fmt: skip
 
 HIDDEN = (512, 256, 128)  # legged_gym
 ROLL_DROP_RATE = 1e-4  # paper
@@ -188,7 +189,7 @@ class AdaptationLearner(Learner):
 
 
 class ROAM(Policy):
-    """Robust autonomous modulation (Chen et al. 2024): an MLP a situation, and each step a draw
+    """Robust autonomous modulation (Chen et al. 2024): an MLP per situation, each step a draw
     among them, i ~ softmax(V_1(s), ..., V_K(s)). In the last stage each acts in its own situation
     (the observation names it) and the values learn who belongs where."""
 

@@ -1,7 +1,7 @@
 """How near to this machine's limit training runs, and how long a newcomer waits for a walk.
 
     python benchmark.py --policies rolt mlp    # one core, whole iterations; half a minute
-    python benchmark.py walk                   # trains until the speed is 80 % of the command
+    python benchmark.py walk                   # 2M steps: when was it at 80 % of the command?
 
 The limit is what cannot be left away: MuJoCo's bare `Batch.step`, and the policy's and critic's
 matrix products at the rate of one large product (in bf16 where training uses it). Times are of one

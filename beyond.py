@@ -1,6 +1,6 @@
 """What the paper does not ask; experiments of evaluate.py like its own (their list is there).
 
-All on flat ground (mechanisms of stairs' policies: stairs), told to walk at 0.75 m/s.
+All on flat ground, told to walk at 0.75 m/s (mechanisms: a policy trained on stairs on stairs).
 """
 
 import sys
@@ -28,6 +28,7 @@ DEAD = "lock", "disable"  # what makes a joint of no use
 HARMS = {harm: f"{harm}:{{}}" for harm in DEAD}
 HARMS |= {f"weaken to {x}": f"weaken:{{}}:{x}" for x in (0.75, 0.5, 0.25)}
 KEY = ("checkpoint", "case", "episode")  # of a row
+GROWN = ("method", "seed", "case")  # of a snapshot; the case is its steps
 # What is late or sensed wrongly, five severities each. The last two: of how many quarters of legs.
 SEVERITIES = {
     "late": (0, 0.01, 0.02, 0.03, 0.04),  # s, all motors
@@ -63,7 +64,8 @@ def mechanisms(args, policies) -> None:
         rows += [row | {"case": name, "value": f"{x:.4f}"} for name, x in numbers.items()]
     columns = {"value": "change of the actions [their deviation]; share"}
     report(args, rows, columns, f"Mechanisms: {args.robot}")
-    dead = [f"{row['method']}, {row['case']}" for row in rows if float(row["value"]) < GATE]
+    dead = [row for row in rows if float(row["value"]) < GATE]
+    dead = [f"{row['method']} {row['seed']}, {row['case']}" for row in dead]
     print(f"\nbelow the gate of {GATE}:", "; ".join(dead) or "nothing")
 
 
@@ -73,7 +75,8 @@ def disturbances(policy, states: Observation):
     if states.heights.numel():
         yield "scan turned round", states._replace(heights=states.heights.flip(1))
         yield "another's scan", states._replace(heights=states.heights[other])
-    yield "another's action token", states._replace(action=states.action[other])
+    if "action" in getattr(policy, "others", ()):
+        yield "another's action token", states._replace(action=states.action[other])
     yield "another's legs", states._replace(legs=states.legs[other])
     for part in ("patch", "leg"):
         if (position := getattr(policy, f"{part}_position", None)) is not None:
@@ -139,16 +142,16 @@ def curves(args, policies) -> None:
 
 def growth(args, policies) -> None:
     """Success on what was never seen, against the steps of training, of --checkpoints
-    runs/*/policy-*M.pt. Other runs stay in growth.csv: snapshots are too many to keep."""
+    runs/*/policy-*M.pt. Others stay in growth.csv: snapshots are too many to ship."""
     rows = walk_cases(args, policies, {fault: fault for fault in TASKS[args.task].unseen}, SPEED)
     steps = {str(path): card["steps"] for path, (_, card) in policies.items()}
     for row in rows:
         row |= {"fault": row["case"], "method": row["method"].split()[0], "seed": str(row["seed"])}
         row["case"] = f"{steps[row['checkpoint']] / 1e6:.1f}"
     if (path := args.out / "growth.csv").exists():
-        new = {(row["method"], row["seed"]) for row in rows}
+        new = {tuple(row[key] for key in GROWN) for row in rows}
         kept = [row for row in read_csv(path) if row["fault"] in TASKS[args.task].unseen]
-        rows = [row for row in kept if (row["method"], row["seed"]) not in new] + rows
+        rows = [row for row in kept if tuple(row[key] for key in GROWN) not in new] + rows
     rows.sort(key=lambda row: float(row["case"]))
     columns = {"success": "success on unseen faults", "share": "share of the distance"}
     report(args, rows, columns, f"Growth: {args.robot}", x="env steps [million]")

@@ -6,6 +6,7 @@ Two kinds, both of torch.save, both dictionaries of plain values and tensors:
     checkpoint.pt  the same in full, and all else that `train.py --resume` needs to go on
 """
 
+import math
 import os
 import sys
 from contextlib import contextmanager
@@ -16,6 +17,7 @@ import torch
 from baselines import make_policy
 from faults import TASKS
 from robots import ROBOTS
+from rolt import SCAN_SHAPE
 
 FORMAT = 2  # 1 was before leg frames
 CARD = ("robot", "task", "policy", "scan", "seed", "steps", "stages", "init", "curve")  # about it
@@ -95,6 +97,9 @@ def start_from(path: str | Path, policy: torch.nn.Module, critic: torch.nn.Modul
             own = module.state_dict()
             for name, x in saved.items():
                 if x.shape != own[name].shape:  # (outputs, inputs)
-                    x = torch.cat([x, torch.zeros(len(x), own[name].shape[1] - x.shape[1])], dim=1)
+                    new = own[name].shape[1] - x.shape[1]
+                    if new != math.prod(SCAN_SHAPE):  # of other faults, a critic's: not at the end
+                        raise RuntimeError(f"{new} inputs of {name} are new, and not the scan's")
+                    x = torch.cat([x, torch.zeros(len(x), new)], dim=1)
                 own[name] = x
             module.load_state_dict(own)

@@ -71,7 +71,7 @@ class EnvConfig:
     forward_speed: tuple[float, float] = (0.3, 1.0)  # m/s, ours (NOTES 5; legged_gym: -1 to 1)
     lateral_speed: tuple[float, float] = (0.0, 0.0)  # m/s, ours: the tests walk forward
     heading: tuple[float, float] = (-0.5, 0.5)  # rad; ours: enough to hold a course
-    friction: tuple[float, float] = (0.5, 1.25)  # legged_gym: once a robot; here at every reset
+    friction: tuple[float, float] = (0.5, 1.25)  # legged_gym: once per robot; here at resets
     start_pose: tuple[float, float] = (0.5, 1.5)  # times the default joint angles, legged_gym
     start_speed: float = 0.5  # m/s and rad/s, the trunk's velocities within +-, legged_gym
     push_seconds: float = 15.0  # legged_gym: then the trunk's velocity is redrawn
@@ -83,8 +83,8 @@ class EnvConfig:
 class LocomotionEnv:
     """N robots of one kind; robot i's episode ends, and is restarted by `step`, on its own.
 
-    num_threads: of the simulator, 0 = one a core. Results do not depend on it.
-    faults: (probability, fault) pairs; each reset draws one. Only their boxes and skates exist.
+    num_threads: of the simulator, 0 = one per core. Results do not depend on it.
+    faults: (probability, fault) pairs; each reset draws one. Boxes and skates exist for these only.
     extras: which of `EXTRAS` the observation holds. None of them changes the simulation.
     terrain: None = flat ground. Robot i stays on column i modulo the number of columns.
     noise: on the scandots (noise.py), for tests; has a generator of its own: all else stays.

@@ -5,7 +5,7 @@
     python evaluate.py claims       # verdicts on the paper's claims, from the CSV files (report.py)
     python evaluate.py watch        # one walks on a screen, in a page or a film (watch.py)
 
-Each prints a table and writes EXPERIMENT.csv (mostly a row an episode) and EXPERIMENT.png to --out.
+Most print a table and write EXPERIMENT.csv (a row per episode) and EXPERIMENT.png to --out.
 A cell is the mean over the seeds of a method (checkpoints/NAME.pt, NAME-seed1.pt, ...) and over the
 episodes of each. Policies act by their mean, without dropout; ROAM draws a behaviour. attention,
 mechanisms and dropout_ratio ignore --episodes and --seconds. The same --seed, the same numbers.
@@ -47,7 +47,8 @@ def fault_test(args, policies, name: str, case_name) -> None:
     for fault in faults:
         parts = fault.split(":")
         one_joint = len(parts) == 2 and "_" in fault  # and no number: the paper has a name for it
-        cases[case_name(parts[1]) if one_joint else fault] = fault
+        case = case_name(parts[1]) if one_joint else fault
+        cases[fault if case in cases else case] = fault
     seen = [case for case, fault in cases.items() if fault in task.seen]
     rows = walk_cases(args, policies, cases, speed=0.75)
     title = f"{name} test: {args.robot}, 0.75 m/s, {args.seconds:g} s"
@@ -60,7 +61,7 @@ def fault_test(args, policies, name: str, case_name) -> None:
 
 def stiffness(args, policies) -> None:
     """Section IV-A (i), figure "Stiffness test results": one calf locked at a time, 0.75 m/s, 20 s.
-    In leg frames the unseen FL is the mirror image of FR (seen), so the hind legs are the test."""
+    In leg frames the unseen FL is the mirror image of FR, which was seen (RESULTS.md)."""
     fault_test(args, policies, "Stiffness", lambda joint: joint[:2])
 
 
@@ -115,7 +116,8 @@ def high_frequency(args, policies) -> None:
 def noise_test(args, policies, kind: str, name: str, x: str) -> None:
     """Against the scale of the noise, on stairs of STAIRS_LEVEL."""
     cases = {f"{scale:g}": (STAIRS_LEVEL, f"{kind}:{scale}") for scale in NOISE_SCALES}
-    on_stairs(args, policies, cases, f"{name}, steps of {100 * rise(STAIRS_LEVEL):.1f} cm", "0", x)
+    name += f", steps of {100 * rise(STAIRS_LEVEL):.1f} cm"
+    on_stairs(args, policies, cases, name, ["0"], x)
 
 
 def attention(args, policies) -> None:
@@ -230,12 +232,12 @@ def main(argv: list[str] | None = None) -> None:
     which = parser.add_mutually_exclusive_group().add_argument
     which("--methods", nargs="+", choices=METHODS, help="of the shipped policies (default: all)")
     which("--checkpoints", nargs="+", type=Path, metavar="FILE", help="instead of the shipped ones")
-    add("--episodes", type=int, default=32, help="a case (default 32)")
+    add("--episodes", type=int, default=32, help="per case (default 32)")
     add("--seconds", type=float, help="an episode (default 20; real_world, gaits 10; films 4)")
     add("--seed", type=int, default=0, help="of the starts")
     add("--threads", type=int, default=os.cpu_count(), help="cores to use (default: all)")
     add("--pairs", action="store_true", help="matrix: of pairs of legs, not of single joints")
-    add("--out", type=Path, default=Path("results"), help="folder of the CSV file and the picture")
+    add("--out", type=Path, help="folder of CSV and picture (default: runs; claims: results)")
     add = parser.add_argument_group("watch").add_argument
     add("--fault", default=HEALTHY, help="for example lock:FR_calf+weaken:RL:0.5 (faults.py)")
     add("--speed", type=float, default=0.75, help="commanded, m/s (default 0.75)")
@@ -247,7 +249,8 @@ def main(argv: list[str] | None = None) -> None:
     args = parser.parse_args(argv)
     try:
         if args.experiment == "claims":
-            return claims(args.out)
+            return claims(args.out or Path(__file__).parent / "results")
+        args.out = args.out or Path("runs")
         function, task, robot, methods = EXPERIMENTS[args.experiment]
         seconds = {"real_world": 10.0, "gaits": 10.0, "watch": 4.0}.get(args.experiment, 20.0)
         args.robot, args.seconds = args.robot or robot, args.seconds or seconds

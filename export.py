@@ -50,11 +50,11 @@ def contract(card: dict, world: LocomotionEnv, inputs: dict[str, torch.Tensor]) 
         "joint_scale": JOINT_SCALE.ravel().tolist(), "trunk_scale": TRUNK_SCALE.tolist(),
         "joint_sign": world._joint_sign.tolist(), "trunk_sign": world._trunk_sign.tolist(),
         "inputs": {name: ["robots", *x.shape[1:]] for name, x in inputs.items()},
-        "leg frames": "joint_sign times angles and velocities, trunk_sign times the last twelve; "
+        "leg_frames": "joint_sign times angles and velocities, trunk_sign times the last twelve; "
         "at the start all steps of the history are the first",
         "output": "actions, leg by leg; whoever applies them clips them to +-max_action; joint "
         "target [rad] = default_pose + action_scale * joint_sign * action",
-        "about the inputs": about.splitlines(),
+        "about_inputs": about.splitlines(),
     }  # fmt: skip
 
 

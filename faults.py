@@ -151,7 +151,8 @@ def faulty_model(fault: str, robot: Robot, healthy: mujoco.MjModel) -> mujoco.Mj
                 for joint in joints_of(robot, part):
                     _harm_joint(model, robot.joints[joint], kind, size)
     except KeyError:
-        raise ValueError(f"no {part}, box or wheel for {fault}: make the env with this") from None
+        why = "boxes and wheels are there for the faults that the env was made with"
+        raise ValueError(f"the model has no {part} for {fault}; {why}") from None
     mujoco.mj_setConst(model, mujoco.MjData(model))  # what follows from masses and the like
     return model
 
@@ -300,7 +301,7 @@ TASKS = {
     ),
     # Section IV-B: "multiple terrains, including stairs, slopes and platforms"; tested with noise.
     "terrain": Task(robots=("a1",), training=((1.0, HEALTHY),), unseen=(), terrain=TRAINING_MAP),
-    # Ours (`evaluate.py legs`): the stiffness task with other faults to learn from. The last comes
+    # Ours (RESULTS.md, `legs`): the stiffness task with other faults to learn from. The last comes
     # and goes, for 2 s of every 4.
     "no-legs": Task(("a1",), ((1.0, HEALTHY),), STIFF),
     "two-legs": Task(("a1",), ((0.5, HEALTHY), (0.25, STIFF[0]), (0.25, STIFF[2])), STIFF[1::2]),

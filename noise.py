@@ -90,6 +90,6 @@ class NoisyScan:
 
 
 def as_points(patches: np.ndarray) -> np.ndarray:
-    """(n, 12, ...) a value a patch -> (n, 16, 12, ...) a value a point."""
+    """(n, 12, ...) values of patches -> (n, 16, 12, ...) of their points."""
     grid = patches.reshape(len(patches), *GRID, *patches.shape[2:])
     return grid.repeat(PATCH, axis=1).repeat(PATCH, axis=2)

@@ -8,8 +8,8 @@ from matplotlib.figure import Figure
 
 from baselines import METHODS
 
-TAB20 = colormaps["tab20"].colors  # ten dark ones, black for ROLT, the last method, ten light ones
-rcParams["axes.prop_cycle"] = cycler(color=[*TAB20[::2], "black", *TAB20[1::2]])
+TAB20 = colormaps["tab20"].colors
+rcParams["axes.prop_cycle"] = cycler(color=TAB20[::2] + TAB20[1::2])  # ten dark, ten light
 rcParams.update({"font.size": 8, "axes.titlesize": 8, "legend.frameon": False})
 
 
@@ -23,12 +23,14 @@ def grid_of_axes(rows: int, columns: int, width: float, height: float, title: st
 def colour_of(name: str, i: int) -> str:
     """A method's, the same in all charts; else that of the i-th."""
     method = name.split(",")[0]  # "mlp, not trained"
+    if method == "rolt":
+        return "black"
     return f"C{[*METHODS].index(method) if method in METHODS else i}"
 
 
 def learning_curves(methods: dict[str, list], picture: Path, title: str) -> None:
-    """methods: {name: a (n, len(CURVE)) array a seed}. A line is the mean of the seeds, a band what
-    lies between the lowest and the highest."""
+    """methods: {name: a (n, len(CURVE)) array per seed}. A line is the mean of the seeds, a band
+    what lies between the lowest and the highest."""
     figure, axes = grid_of_axes(1, 3, 4, 3, title)
     names = "return of an episode", "speed / commanded speed", "share of falls"
     for axis, name in zip(axes[0], names):
@@ -47,7 +49,7 @@ def learning_curves(methods: dict[str, list], picture: Path, title: str) -> None
 
 def chart(panels: dict[str, dict], cases: list[str], picture: Path, title: str, x: str) -> None:
     """panels: {what: {method: (mean, low, high, seeds' means) of each case}}. A bar or, where the
-    cases are numbers and x says of what, a curve a method, with its interval; a dot a seed."""
+    cases are numbers and x says of what, a curve per method, with its interval; a dot per seed."""
     figure, axes = grid_of_axes(1, len(panels), max(5.2, 0.75 * len(cases)), 4, title)
     for axis, (what, methods) in zip(axes[0], panels.items()):
         width = 0.8 / len(methods)
@@ -75,7 +77,7 @@ def chart(panels: dict[str, dict], cases: list[str], picture: Path, title: str, 
 
 
 def heat_maps(maps: dict[str, tuple], rows, columns, picture: Path, title: str) -> None:
-    """A panel a method: {name: (shares, falls)}, each (rows, columns); falls are written in."""
+    """A panel per method: {name: (shares, falls)}, each (rows, columns); falls are written in."""
     figure, axes = grid_of_axes(1, len(maps), 2.2, 0.8 + 0.22 * len(rows), title)
     for axis, (name, (shares, falls)) in zip(axes[0], maps.items()):
         image = axis.imshow(shares, cmap="viridis", vmin=0, vmax=1, aspect="auto")
@@ -90,7 +92,7 @@ def heat_maps(maps: dict[str, tuple], rows, columns, picture: Path, title: str) 
 
 
 def attention_maps(panels: dict[str, dict[str, np.ndarray]], picture: Path) -> None:
-    """A row a situation: (16, 12) scandots, then each method's (4, 3) attention on the patches."""
+    """A row per situation: (16, 12) scandots, each method's (4, 3) attention on the patches."""
     title = "Trunk height - 0.3 m - ground, and the attention on its 12 patches; forward is up"
     figure, axes = grid_of_axes(len(panels), max(map(len, panels.values())), 2.6, 2.9, title)
     for line, (situation, row) in zip(axes, panels.items()):

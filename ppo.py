@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 import torch
 import torch.distributed as dist
-import torch.distributed.nn  # else torch.optim does, later, and it keeps the group alive
+import torch.distributed.nn  # now, not by torch.optim later: that keeps the group alive
 from torch import Tensor, nn
 from torch.distributions import Normal, kl_divergence
 
@@ -32,7 +32,7 @@ class PPOConfig:
     discount: float = 0.99  # gamma, legged_gym
     gae_lambda: float = 0.95  # legged_gym
     clip: float = 0.2  # legged_gym
-    entropy_weight: float = 0.005  # ours: at legged_gym's 0.01 a short run's sigma stays large
+    entropy_weight: float = 0.005  # first; falls to 0, ours: else a short run's sigma stays large
     value_weight: float = 1.0  # legged_gym
     max_gradient_norm: float = 1.0  # legged_gym
     learning_rate: float = 1e-4  # first, ours: at 1e-3 a transformer jumps before the rule reacts
@@ -53,8 +53,9 @@ def proprioception(legs: Tensor) -> Tensor:
 
 
 class Critic(nn.Module):
-    """V(s), the same for all methods: an MLP [512, 256, 128] ELU (legged_gym). In training only, so
-    it sees what no policy does: faults, clean heights (Pinto et al. 2018; NOTES 10)."""
+    """V(s), for all methods (but ROAM's last stage) an MLP [512, 256, 128] ELU (legged_gym). In
+    training only, so it sees what no policy does: faults, clean heights (Pinto et al. 2018; NOTES
+    10)."""
 
     def __init__(self, observation: Observation):
         super().__init__()

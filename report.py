@@ -25,7 +25,7 @@ TRAINED, FALLS = 0.8, 0.05  # of the command, of episodes: worse on what it has 
 
 
 def by_seed(rows: list[dict], column: str, **where) -> list[np.ndarray]:
-    """The column's numbers, an array a seed, of the rows where other columns have these values."""
+    """The column's numbers, an array per seed, where other columns have these values."""
     seeds = {}
     for row in rows:
         if all(row[key] == value for key, value in where.items()):
@@ -92,7 +92,7 @@ def trained(rows: list[dict], method: str) -> bool:
 
 
 def uses(rows: list[dict], method: str, case: str) -> bool:
-    """Do all seeds of the method walk on the leg that this case harms?"""
+    """Does every seed of the method use the leg that this case harms?"""
     duties = by_seed(rows, "leg_duty", method=method, case=case)
     return not any((x < USED).any() for x in duties)
 
@@ -176,8 +176,8 @@ CLAIMS = (
     Claim("... better than without shared legs", "stiffness", "success", UNSHARED, ("RR", "RL")),
     Claim("... or with a position for each leg", "stiffness", "success", ("module-pe",),
           ("RR", "RL")),
-    Claim("... or with no sign of which leg is which, FL too (ours)", "stiffness", "success",
-          ("no-identity",)),
+    Claim("... better than our controls, FL too", "stiffness", "success",
+          ("no-identity", "mirrored-mlp", "no-leg-frames")),
     Claim("walks with FL locked (added later: RESULTS.md)", "stiffness", "success",
           (0.8, "module-pe", *UNSHARED), ("FL",)),
     Claim("stays up with motors it never saw dead", "damage", "upright", (0.95,)),
@@ -217,7 +217,8 @@ def judge(ours: list[np.ndarray], theirs: list[np.ndarray] | float) -> tuple[str
     needed = "-" if verdict != "undecided" else f"{SEEDS}"
     if enough and verdict == "undecided":
         spread = a.std(ddof=1) + (0 if number else b.std(ddof=1))
-        needed = f"{max(SEEDS, math.ceil((1.96 * spread / gap) ** 2))}" if gap else "more"
+        more = (len(a) if number else max(len(a), len(b))) + 1
+        needed = f"{max(more, math.ceil((1.96 * spread / gap) ** 2))}" if gap else "more"
     low, high = interval(draws[0] - draws[1])
     return f"{gap:+.2f} ({low:+.2f} to {high:+.2f})", verdict, needed
 

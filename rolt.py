@@ -36,7 +36,7 @@ Masks = dict[str, Tensor]  # what a policy drew in the rollout: (B, ...) bool, T
 
 
 class Observation(NamedTuple):
-    """What robots see; the table at the head of env.py says what each number is. Tensors here."""
+    """What robots see; the table at the head of env.py says what each number is (M, too)."""
 
     legs: Tensor  # (B, L, H, 3J + 12)
     action: Tensor  # (B, L*J)
@@ -126,7 +126,7 @@ class EncoderLayer(nn.Module):
 
 
 class ROLT(nn.Module):
-    """Gaussian policy: each action's mean from the transformer, a learned std a kind of joint."""
+    """Gaussian policy: each action's mean from the transformer, a learned std per kind of joint."""
 
     replays_masks = True  # in the update, train.py asks (Roll-Drop does not)
 
@@ -136,11 +136,8 @@ class ROLT(nn.Module):
         self.extras = ("heights",) if config.scan else ()  # that it reads, see env.py
         self.leg_frames = config.leg_frames
 
-        self.others = {}  # tokens beside the legs', in their order
-        if config.identity == "action":
-            self.others["action"] = 1
-        if config.scan:
-            self.others["patches"] = NUM_PATCHES
+        others = {"action": config.identity == "action", "patches": NUM_PATCHES * config.scan}
+        self.others = {name: n for name, n in others.items() if n}  # tokens beside the legs'
 
         D = config.width
         inputs = HISTORY * (3 * num_joints + 12)  # numbers that one leg sees

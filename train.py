@@ -7,7 +7,8 @@
     torchrun --nproc-per-node=2 train.py --paper --device cuda    # the paper's size, on two GPUs
 
 Everything goes to runs/ROBOT-TASK-POLICY-seedN (or --out): policy.pt (for evaluate.py),
-checkpoint.pt (for --resume), progress.csv (a row an iteration) and progress.png.
+checkpoint.pt (for --resume), progress.csv (a row per iteration) and progress.png; policy-2M.pt and
+so on are snapshots, five in a run.
 
 On a CPU every core gets a process with its share of the robots, and gradients are averaged: two
 processes of one thread run nearly twice as fast as one process of two threads.
@@ -75,6 +76,8 @@ def parse_arguments(argv: list[str] | None = None):
     args.task = args.task or first_task(args.robot)
     task = TASKS[args.task]
     args.scan |= task.terrain is not None
+    if args.seed < 0:
+        parser.error("a seed is from 0 on")
     if "" in (args.out, args.init):
         parser.error("the name of a file or folder is empty")
     name = f"{args.robot}-{args.task}-{args.policy}-seed{args.seed}"
@@ -195,7 +198,7 @@ def train(rank: int, args, sync: str) -> None:
             checkpoint.save(content, args.out / "checkpoint.pt")
             checkpoint.save_policy(content, args.out / "policy.pt")
             if snapshot:  # to see how a policy grew
-                checkpoint.save_policy(content, args.out / f"policy-{steps / 1e6:.1f}M.pt")
+                checkpoint.save_policy(content, args.out / f"policy-{steps / 1e6:.2g}M.pt")
             curves = {args.policy: [content["curve"].numpy()]}
             learning_curves(curves, args.out / "progress.png", args.out.name)
 
