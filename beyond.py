@@ -141,19 +141,22 @@ def curves(args, policies) -> None:
 
 
 def growth(args, policies) -> None:
-    """Success on what was never seen, against the steps of training, of --checkpoints
+    """Success on each unseen fault, against the steps of training, of --checkpoints
     runs/*/policy-*M.pt. Others stay in growth.csv: snapshots are too many to ship."""
-    rows = walk_cases(args, policies, {fault: fault for fault in TASKS[args.task].unseen}, SPEED)
+    faults = TASKS[args.task].unseen
+    rows = walk_cases(args, policies, {fault: fault for fault in faults}, SPEED)
     steps = {str(path): card["steps"] for path, (_, card) in policies.items()}
     for row in rows:
         row |= {"fault": row["case"], "method": row["method"].split()[0], "seed": str(row["seed"])}
         row["case"] = f"{steps[row['checkpoint']] / 1e6:.1f}"
     if (path := args.out / "growth.csv").exists():
         new = {tuple(row[key] for key in GROWN) for row in rows}
-        kept = [row for row in read_csv(path) if row["fault"] in TASKS[args.task].unseen]
+        kept = [row for row in read_csv(path) if row["fault"] in faults]
         rows = [row for row in kept if tuple(row[key] for key in GROWN) not in new] + rows
     rows.sort(key=lambda row: float(row["case"]))
-    columns = {"success": "success on unseen faults", "share": "share of the distance"}
+    for row in rows:
+        row |= {fault: row["success"] if fault == row["fault"] else "" for fault in faults}
+    columns = {fault: f"success, {fault}" for fault in faults}
     report(args, rows, columns, f"Growth: {args.robot}", x="env steps [million]")
 
 

@@ -72,7 +72,7 @@ def chart(panels: dict[str, dict], cases: list[str], picture: Path, title: str, 
         axis.set(ylabel=what, xlabel=x)
         axis.grid(axis="y", alpha=0.3)
     handles = axes[0, 0].get_legend_handles_labels()
-    figure.legend(*handles, loc="outside lower center", ncols=min(6, len(methods)))
+    figure.legend(*handles, loc="outside lower center", ncols=min(6, 2 + 2 * len(panels)))
     figure.savefig(picture)
 
 

@@ -28,7 +28,7 @@ def by_seed(rows: list[dict], column: str, **where) -> list[np.ndarray]:
     """The column's numbers, an array per seed, where other columns have these values."""
     seeds = {}
     for row in rows:
-        if all(row[key] == value for key, value in where.items()):
+        if row[column] != "" and all(row[key] == value for key, value in where.items()):
             seeds.setdefault(row["seed"], []).append(float(row[column]))
     return [np.array(numbers) for numbers in seeds.values()]
 
