@@ -81,8 +81,8 @@ def env_of(n, robot="a1", config=EnvConfig(), **options):
 
 def env_with(*faults, robot="a1", config=QUIET, **options):
     """An env of one robot a fault, just reset."""
-    options = {"num_threads": 1, "faults": [(1.0, fault) for fault in faults]} | options
-    env = LocomotionEnv(robot, len(faults), config=config, **options)
+    odds = [(1.0, fault) for fault in faults]
+    env = LocomotionEnv(robot, len(faults), 0, 1, odds, config, **options)
     env.pin_faults(list(faults))
     env.reset()
     return env
@@ -103,11 +103,19 @@ def flail(env, rng, steps=1):
 
 
 def go_on_alike(one, two, rng, steps):
-    """Both envs, given the same random actions, answer alike to the bit."""
+    """Both envs, given the same random actions, answer and lock alike to the bit."""
     for _ in range(steps):
         action = rng.normal(size=(one.num_envs, one.num_actions))
-        a, b = one.step(action), two.step(action)
-        assert all(np.array_equal(x, y) for x, y in zip((*a[0], *a[1:4]), (*b[0], *b[1:4])))
+        answers = []
+        for env in (one, two):
+            seen, *answer, info = env.step(action)
+            answers.append([*seen, *answer, info["position"], env.world.bind("eq_active")])
+        assert all(map(np.array_equal, *answers))
+
+
+@pytest.fixture
+def rng():
+    return np.random.default_rng(0)
 
 
 @pytest.fixture(autouse=True)
