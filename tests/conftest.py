@@ -51,24 +51,23 @@ def fresh_policy(name, task="stiffness", scan=False):
     return policy
 
 
-def rollout_of(policy, stage=0, n=8, precision="fp32"):
-    """A stage of the training (train.py) with one rollout in its buffer, and the generator."""
-    words = f"--envs {n} --epochs 2 --minibatches 2 --threads 1 --precision {precision} --out none"
-    args = train.parse_arguments([*words.split(), "--device", "cpu"])
-    stage = training_stages(policy, TASKS["stiffness"])[stage]
+def rollout_of(policy, stage=0, n=8, precision="fp32", task="stiffness"):
+    """A stage of the training (train.py) with one rollout in its buffer, and its generator."""
+    words = f"--task {task} --envs {n} --epochs 2 --minibatches 2 --precision {precision}"
+    args = train.parse_arguments(f"{words} --threads 1 --device cpu --out none".split())
+    stage = training_stages(policy, TASKS[task])[stage]
     run = train.StageRun(0, stage, args, 0, policy, "cpu")
-    generator = torch.Generator().manual_seed(0)
-    collect(
-        run.env, run.actor, run.critic, run.buffer, run.observation, generator, run.learner.bf16
-    )
-    return run, generator
+    run.generator = torch.Generator().manual_seed(0)
+    world = run.env, run.actor, run.critic, run.buffer, run.observation
+    collect(*world, run.generator, run.learner.bf16)
+    return run
 
 
-def ratio(policy, batch, std, masks, bf16=False):
-    """PPO's, of a minibatch."""
-    with torch.no_grad():
-        mean = mean_action(policy, batch["observation"], masks, bf16)
-    log_prob = torch.distributions.Normal(mean, std).log_prob(batch["action"]).sum(-1)
+@torch.no_grad()
+def ratio(run, batch):
+    """PPO's, of a minibatch of such a rollout."""
+    mean = mean_action(run.actor, batch["observation"], batch["masks"], run.learner.bf16)
+    log_prob = torch.distributions.Normal(mean, run.buffer.std).log_prob(batch["action"]).sum(-1)
     return (log_prob - batch["log_prob"]).exp()
 
 
