@@ -40,26 +40,22 @@ def test_a_lock_that_strikes_holds_where_it_is_also_when_another_fault_comes(rng
     assert abs(before) > 0.03 and env.joint_error[0, 0, 2] == pytest.approx(before, abs=0.01)
 
 
-def test_what_has_ended_leaves_nothing_behind(rng):
-    """The state after it, given to a robot whose faults never come, goes on alike to the bit."""
-    later = ALL.replace("@0.1:0.2", "@8:9").replace("@0.14", "@8")
-    env, other = env_with(ALL, ALL), env_with(later, later)
-    flail(env, rng, 10)
-    assert env.fault_now[0].count("+") == 6  # the blow is over
-    flail(env, rng)
-    flail(other, rng)
-    other.world.state[:] = env.world.state
-    for world in (env, other):
-        flail(world, np.random.default_rng(1), 20)
-    assert np.array_equal(env.world.bind("qpos"), other.world.bind("qpos"))
-    assert np.array_equal(env._newest_step()[..., :6], other._newest_step()[..., :6])
-
-
-def test_an_interrupted_env_goes_on_alike_in_the_middle_of_faults(rng):
+def test_an_env_goes_on_to_the_bit_amid_faults_and_when_they_end_nothing_is_left_behind(rng):
+    """Given their state then, a robot whose faults never come goes on alike."""
     whole, again = env_with(ALL, HEALTHY), env_with(ALL, HEALTHY)
     flail(whole, rng, 8)
+    assert whole.fault_now[0].count("+") == 7  # all of them
     again.load_state_dict(whole.state_dict())
-    go_on_alike(whole, again, rng, 8)
+    go_on_alike(whole, again, rng, 3)
+
+    later = ALL.replace("@0.1:0.2", "@8:9").replace("@0.14", "@8")
+    other = env_with(later, HEALTHY)
+    flail(other, rng)
+    other.world.state[:] = whole.world.state
+    for env in (whole, other):
+        flail(env, np.random.default_rng(1), 20)
+    assert np.array_equal(whole.world.bind("qpos"), other.world.bind("qpos"))
+    assert np.array_equal(whole._newest_step()[..., :6], other._newest_step()[..., :6])
 
 
 def test_what_comes_and_goes_repeats_with_the_seed():
