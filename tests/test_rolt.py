@@ -47,7 +47,6 @@ def test_module_pe_tells_apart_legs_that_see_the_same_and_only_rolt_reads_the_ac
 
 def test_pruned_last_layer_equals_the_full_one():
     policy, obs = model(), observation()
-    policy.eval()
     x = policy.tokens(obs, {})
     for layer in policy.encoder:
         x, _ = layer(x, x.shape[1], None, None)  # all tokens, also those that nobody reads
