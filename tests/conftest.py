@@ -51,24 +51,23 @@ def fresh_policy(name, task="stiffness", scan=False):
     return policy
 
 
-def rollout_of(policy, stage=0, n=8, precision="fp32"):
-    """A stage of the training (train.py) with one rollout in its buffer, and the generator."""
-    words = f"--envs {n} --epochs 2 --minibatches 2 --threads 1 --precision {precision} --out none"
-    args = train.parse_arguments([*words.split(), "--device", "cpu"])
-    stage = training_stages(policy, TASKS["stiffness"])[stage]
+def rollout_of(policy, stage=0, n=8, precision="fp32", task="stiffness"):
+    """A stage of the training (train.py) with one rollout in its buffer, and its generator."""
+    words = f"--task {task} --envs {n} --epochs 2 --minibatches 2 --precision {precision}"
+    args = train.parse_arguments(f"{words} --threads 1 --device cpu --out none".split())
+    stage = training_stages(policy, TASKS[task])[stage]
     run = train.StageRun(0, stage, args, 0, policy, "cpu")
-    generator = torch.Generator().manual_seed(0)
-    collect(
-        run.env, run.actor, run.critic, run.buffer, run.observation, generator, run.learner.bf16
-    )
-    return run, generator
+    run.generator = torch.Generator().manual_seed(0)
+    world = run.env, run.actor, run.critic, run.buffer, run.observation
+    collect(*world, run.generator, run.learner.bf16)
+    return run
 
 
-def ratio(policy, batch, std, masks, bf16=False):
-    """PPO's, of a minibatch."""
-    with torch.no_grad():
-        mean = mean_action(policy, batch["observation"], masks, bf16)
-    log_prob = torch.distributions.Normal(mean, std).log_prob(batch["action"]).sum(-1)
+@torch.no_grad()
+def ratio(run, batch):
+    """PPO's, of a minibatch of such a rollout."""
+    mean = mean_action(run.actor, batch["observation"], batch["masks"], run.learner.bf16)
+    log_prob = torch.distributions.Normal(mean, run.buffer.std).log_prob(batch["action"]).sum(-1)
     return (log_prob - batch["log_prob"]).exp()
 
 
@@ -81,8 +80,8 @@ def env_of(n, robot="a1", config=EnvConfig(), **options):
 
 def env_with(*faults, robot="a1", config=QUIET, **options):
     """An env of one robot a fault, just reset."""
-    options = {"num_threads": 1, "faults": [(1.0, fault) for fault in faults]} | options
-    env = LocomotionEnv(robot, len(faults), config=config, **options)
+    odds = [(1.0, fault) for fault in faults]
+    env = LocomotionEnv(robot, len(faults), 0, 1, odds, config, **options)
     env.pin_faults(list(faults))
     env.reset()
     return env
@@ -103,11 +102,19 @@ def flail(env, rng, steps=1):
 
 
 def go_on_alike(one, two, rng, steps):
-    """Both envs, given the same random actions, answer alike to the bit."""
+    """Both envs, given the same random actions, answer and lock alike to the bit."""
     for _ in range(steps):
         action = rng.normal(size=(one.num_envs, one.num_actions))
-        a, b = one.step(action), two.step(action)
-        assert all(np.array_equal(x, y) for x, y in zip((*a[0], *a[1:4]), (*b[0], *b[1:4])))
+        answers = []
+        for env in (one, two):
+            seen, *answer, info = env.step(action)
+            answers.append([*seen, *answer, info["position"], env.world.bind("eq_active")])
+        assert all(map(np.array_equal, *answers))
+
+
+@pytest.fixture
+def rng():
+    return np.random.default_rng(0)
 
 
 @pytest.fixture(autouse=True)

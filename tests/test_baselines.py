@@ -16,18 +16,19 @@ from ppo import proprioception, to_tensors
 TASK = TASKS["stiffness"]
 
 
-def observe(policy, n=6):
-    env = env_of(n, faults=TASK.training, extras=policy.extras)
+def acting(name):
+    """A fresh policy, and what it sees after three steps."""
+    policy = fresh_policy(name)
+    env = env_of(6, faults=TASK.training, extras=policy.extras)
     for step in range(3):
-        observation, *_ = env.step(np.full((n, 12), 0.3 * step))
-    return to_tensors(observation, "cpu")
+        observation, *_ = env.step(np.full((6, 12), 0.3 * step))
+    return policy, to_tensors(observation, "cpu")
 
 
 @pytest.mark.parametrize("name", METHODS)
 @torch.no_grad()
 def test_every_policy_acts_and_survives_saving(name, tmp_path):
-    policy = fresh_policy(name)
-    observation = observe(policy)
+    policy, observation = acting(name)
     action = policy(observation)
     assert action.shape == (6, 12) and policy.std().shape == (12,)
     halved = {key: x.half() for key, x in policy.state_dict().items()}  # as checkpoint.py ships it
@@ -39,13 +40,16 @@ def test_every_policy_acts_and_survives_saving(name, tmp_path):
 
 
 @pytest.mark.parametrize("name", METHODS)
-def test_each_stage_trains_its_weights_and_no_others(name):
+def test_each_stage_trains_its_weights_alone_and_who_acts_has_the_whole_budget(name):
+    """What chooses among policies, or guesses, comes on top."""
     policy, trained = fresh_policy(name), set()
-    for stage in range(len(training_stages(policy, TASK))):
+    shares = [stage.share for stage in training_stages(policy, TASK)]
+    assert shares == {"rma": [1.0, 0.2], "roam": [1.0, 1.0, 0.2]}.get(name, [1.0])
+    for stage in range(len(shares)):
         before = {key: value.clone() for key, value in policy.state_dict().items()}
-        run, generator = rollout_of(policy, stage)
+        run = rollout_of(policy, stage)
         names = {key for key, p in policy.named_parameters() if p.requires_grad}
-        run.learner.update(run.buffer, generator)
+        run.learner.update(run.buffer, run.generator)
         after = policy.state_dict()
         moved = {key for key in after if not torch.equal(after[key], before[key])}
         assert moved == names
@@ -54,7 +58,7 @@ def test_each_stage_trains_its_weights_and_no_others(name):
 
 
 def test_a_mirrored_mlp_answers_a_mirrored_state_with_the_mirrored_action():
-    policy, observation = fresh_policy("mirrored-mlp"), observe(fresh_policy("mirrored-mlp"))
+    policy, observation = acting("mirrored-mlp")
     image = observation._replace(legs=observation.legs[:, [1, 0, 3, 2]])  # in leg frames, all of it
     actions, mirrored = policy(observation).view(6, 4, 3), policy(image).view(6, 4, 3)
     assert torch.allclose(mirrored, actions[:, [1, 0, 3, 2]], atol=1e-5)
@@ -64,32 +68,22 @@ def test_a_mirrored_mlp_answers_a_mirrored_state_with_the_mirrored_action():
 def test_proprioception_holds_every_number_once():
     legs = torch.arange(2 * 4 * 10 * 21, dtype=torch.float32).view(2, 4, 10, 21)
     legs[:, :, :, 9:] = legs[:, :1, :, 9:]  # as in the env: all legs see the same body
-    seen = proprioception(legs)
-    assert seen.shape == (2, 480)
     own, body = legs[1, :, 3, :9].flatten().tolist(), legs[1, 2, 3, 9:].tolist()
-    assert seen.view(2, 10, 48)[1, 3].tolist() == own + body
+    assert proprioception(legs).view(2, 10, 48)[1, 3].tolist() == own + body
 
 
 def test_roll_drops_ratio_is_off_where_a_neuron_was_dropped(monkeypatch):
-    """At a rate of 1 % nearly every sample of 896 neurons is hit; at the paper's 0.01 %, one in
-    twelve or so."""
-    off = {}
+    """Of 896: at a rate of 1 % in nearly every sample, at the paper's 0.01 % in one of twelve."""
     for rate in (1e-2, ROLL_DROP_RATE):
         monkeypatch.setattr("baselines.ROLL_DROP_RATE", rate)
-        policy = fresh_policy("roll-drop")
-        buffer = rollout_of(policy, n=32)[0].buffer
-        assert not buffer.masks
-        batch = buffer.minibatch(torch.arange(len(buffer)))
-        far = (ratio(policy, batch, buffer.std, batch["masks"]) - 1).abs() > 1e-3
-        off[rate] = far.float().mean().item()
-    assert off[1e-2] > 0.95
-    hit = 1 - (1 - ROLL_DROP_RATE) ** 896  # 0.086
-    assert off[ROLL_DROP_RATE] == pytest.approx(hit, abs=0.04)
+        run = rollout_of(fresh_policy("roll-drop"), n=32)
+        assert not run.buffer.masks
+        off = (ratio(run, run.buffer.minibatch(torch.arange(32 * 24))) - 1).abs() > 1e-3
+        assert off.float().mean().item() == pytest.approx(1 - (1 - rate) ** 896, abs=0.04)
 
 
 def test_rma_reads_nothing_privileged_at_test():
-    policy = fresh_policy("rma")
-    observation = observe(policy)
+    policy, observation = acting("rma")
     assert observation.privileged.numel() == 0  # the env does not even give it
     poisoned = observation._replace(privileged=torch.full((6, 25), math.nan))
     assert torch.equal(policy(observation), policy(poisoned))
@@ -116,18 +110,10 @@ def test_roams_loss_by_hand():
 
 
 def test_roam_acts_in_training_by_its_situation_and_at_test_by_its_values():
-    policy = fresh_policy("roam")
-    observation = observe(policy)
+    policy, observation = acting("roam")
     each = torch.stack([behaviour(observation) for behaviour in policy.behaviours])
     for index in (0, 1):
         told = observation._replace(situation=torch.full((6, 1), float(index)))
         assert torch.equal(policy(told), each[index])
     torch.nn.init.constant_(policy.critics[1][-1].bias, 50.0)  # e^-50: surely the second
     assert torch.equal(policy(observation), each[1])
-
-
-def test_every_policy_that_acts_has_the_whole_budget():
-    """What chooses among policies, or guesses, comes on top."""
-    budgets = {"rolt": [1.0], "mlp": [1.0], "rma": [1.0, 0.2], "roam": [1.0, 1.0, 0.2]}
-    for name, shares in budgets.items():
-        assert [stage.share for stage in training_stages(fresh_policy(name), TASK)] == shares

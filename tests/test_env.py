@@ -11,26 +11,14 @@ from env import CONTROL_DT, EnvConfig, LocomotionEnv
 from faults import TASKS
 from robots import A1
 
-ON_ITS_BACK = [0, 1, 0, 0]  # a quaternion
 
-
-def rollout(threads=1, seed=0):
-    """Of robots on which locks come and go."""
-    env = LocomotionEnv("a1", 8, seed, threads, TASKS["mid-stride"].training)
-    env.reset(random_ages=True)
-    rng, trace = np.random.default_rng(1), []
-    for _ in range(60):
-        *answer, info = flail(env, rng)
-        locked = env.world.bind("eq_active").copy()
-        trace += [*answer[0], *answer[1:], info["position"], locked]
-    assert 0 < locked.sum() < 8
-    return trace
-
-
-def test_bit_identical_for_a_seed_at_any_number_of_threads():
-    one, two, other = rollout(threads=1), rollout(threads=2), rollout(seed=5)
-    assert all(np.array_equal(a, b) for a, b in zip(one, two))
-    assert not all(np.array_equal(a, b) for a, b in zip(one, other))
+def test_bit_identical_for_a_seed_at_any_number_of_threads_where_locks_come_and_go(rng):
+    how = (0, 1), (0, 2), (5, 1)  # seed, threads
+    envs = [LocomotionEnv("a1", 8, *one, TASKS["mid-stride"].training) for one in how]
+    first, second, other = (env.reset(random_ages=True).legs for env in envs)
+    assert np.array_equal(first, second) and not np.array_equal(first, other)
+    go_on_alike(*envs[:2], rng, 60)
+    assert 0 < envs[0].world.bind("eq_active").sum() < 8
 
 
 def test_wrong_use_is_refused():
@@ -50,53 +38,50 @@ def test_wrong_use_is_refused():
     ("a1", TASKS["terrain"].training, TASKS["terrain"].terrain),
     ("go1", ((0.5, "tow:RR"), (0.5, "skate:FR+half-lock:RL_calf:-1.6")), None),
 ])  # fmt: skip
-def test_goes_on_to_the_bit_after_a_break(robot, faults, terrain):
-    how = robot, 6, 2, 1, faults, EnvConfig(episode_seconds=0.5), (), terrain
+def test_goes_on_to_the_bit_after_a_break(robot, faults, terrain, rng):
+    config = EnvConfig(episode_seconds=0.5, command_seconds=0.3)
+    how = robot, 6, 2, 1, faults, config, (), terrain
     env, twin = LocomotionEnv(*how), LocomotionEnv(*how)
     env.reset(random_ages=True)
-    rng = np.random.default_rng(0)
     flail(env, rng, 20)
     twin.load_state_dict(env.state_dict())
-    assert all(np.array_equal(x, y) for x, y in zip(env.observe(), twin.observe()))
+    assert all(map(np.array_equal, env.observe(), twin.observe()))
     go_on_alike(env, twin, rng, 20)  # resets included: an episode has 25 steps
 
 
-def test_history_rolls_oldest_first_and_starts_filled():
+def test_history_rolls_oldest_first_and_starts_filled(rng):
     env = env_of(3, extras=("past",))
     before = env.observe().legs
-    assert before.shape == (3, 4, 10, 21)
     assert np.array_equal(before, np.repeat(before[:, :, :1], 10, axis=2))
-    rng = np.random.default_rng(0)
+
     mirrored = np.array([[1, 1, 1], [-1, 1, 1]] * 2)  # hips of left legs
     for _ in range(60):
         action = rng.normal(size=(3, 12))
         after, *_ = env.step(action)
         assert np.array_equal(after.legs[:, :, :-1], before[:, :, 1:])
         own, body = after.legs[:, :, -1, :9], after.legs[:, 2, -1, 9:]
-        assert np.allclose(own[:, :, 0:3], 4 * mirrored * env.joint_error)
-        assert np.allclose(own[:, :, 3:6], 0.2 * mirrored * env.joint_velocity)
-        assert np.allclose(own[:, :, 6:9], action.reshape(3, 4, 3))  # its own previous action
+        joints = 4 * mirrored * env.joint_error, 0.2 * mirrored * env.joint_velocity
+        assert np.allclose(own, np.dstack([*joints, action.reshape(3, 4, 3)]))  # its own action
         assert np.allclose(after.action, action)
         parts = 2 * env.command, 2 * env.linear_velocity, env.angular_velocity
         assert np.allclose(body[:, :9], np.hstack(parts)) and all(part.any() for part in parts)
         assert np.allclose(body[:, 9:], 5 * (env.gravity + (0, 0, 1)), atol=1e-6)
         before = after.legs
+
     assert after.past.shape == (3, 4, 50, 21)
     assert np.array_equal(after.legs, after.past[:, :, -10:])
 
 
 def test_a_trunk_tilted_by_60_degrees_or_on_the_ground_has_fallen_and_the_others_go_on():
     env = env_of(3)
-    degrees, height = np.array([50, 70, 0]), [2.0, 2.0, 0.05]
-    half = np.radians(degrees) / 2
+    half = np.radians([50, 70, 0]) / 2
     env._qpos[:, :7] = 0
-    env._qpos[:, 2:5] = np.stack([height, np.cos(half), np.sin(half)], axis=1)
+    env._qpos[:, 2:5] = np.transpose([[2.0, 2.0, 0.05], np.cos(half), np.sin(half)])
     env._qpos[:, 7:] = np.tile([0.0, 2.8, -2.6], 4)  # legs folded beside the trunk
     env._qvel[:] = 0
     _, reward, terminated, truncated, info = rest(env)
     assert terminated.tolist() == [False, True, True] and not truncated.any()
-    assert reward[1] == pytest.approx(rewards.FALL, abs=0.05)  # a fall costs, once
-    assert reward[0] >= 0
+    assert reward[1] == pytest.approx(rewards.FALL, abs=0.05) and reward[0] >= 0  # costs, once
     assert env.age.tolist() == [1, 0, 0] and len(info["episode_returns"]) == 2
     assert env.gravity[1, 2] == pytest.approx(-1)  # upright again
 
@@ -112,8 +97,7 @@ def test_body_velocities_and_gravity_are_in_the_trunks_frame():
     assert env.yaw[0] == pytest.approx(np.pi / 2)
     assert env.linear_velocity[0] == pytest.approx([0, -1, 0])
     assert env.angular_velocity[0] == pytest.approx([0, 0, 0.7])
-    assert env.gravity[0] == pytest.approx([0, 0, -1])
-    assert env.gravity[1] == pytest.approx([np.sin(0.3), 0, -np.cos(0.3)])
+    assert np.allclose(env.gravity, [[0, 0, -1], [np.sin(0.3), 0, -np.cos(0.3)]])
 
 
 def test_steering_follows_the_heading():
@@ -129,15 +113,13 @@ def test_a_command_lasts_through_falls_and_changes_between_episodes_only():
     env = env_of(2, config=EnvConfig(episode_seconds=0.2, command_seconds=0.1, start_speed=0.0))
     first = env.command[:, 0].copy()
     rest(env, 3)
-    env._qpos[0, 3:7] = ON_ITS_BACK  # robot 0 falls before its command is old: it tries again
+    env._qpos[0, 3:7] = [0, 1, 0, 0]  # robot 0 falls before its command is old: it tries again
     assert rest(env)[2][0]
-    assert np.array_equal(env.command[:, 0], first)
-    for _ in range(5):
+    for _ in range(6):
+        assert np.array_equal(env.command[:, 0], first)  # old by then, but not within an episode
         rest(env)
-        assert np.array_equal(env.command[:, 0], first)  # old by now, but not within an episode
-    rest(env)  # robot 1's time is up
-    assert env.command[0, 0] == first[0] and env.command[1, 0] != first[1]
-    env._qpos[0, 3:7] = ON_ITS_BACK  # with an old command
+    assert env.command[0, 0] == first[0] and env.command[1, 0] != first[1]  # whose time was up
+    env._qpos[0, 3:7] = [0, 1, 0, 0]  # with an old command
     rest(env)
     assert env.command[0, 0] != first[0]
 
@@ -155,9 +137,6 @@ def test_timeout_gives_the_true_last_observation_and_restarts():
     assert info["episode_lengths"].tolist() == [5, 5] and env.age.tolist() == [0, 0]
 
 
-REACH = 0.2 * np.cos(0.8) + 0.2 * np.cos(0.7) + 0.02  # m: thigh, calf, foot; a standing trunk
-
-
 def test_a_foot_in_the_air_for_one_step_has_not_stepped():
     env, touchdowns = env_of(1), []
     env._contacts = np.zeros(env._contacts.shape)
@@ -172,7 +151,7 @@ def test_a_foot_in_the_air_for_one_step_has_not_stepped():
 def test_air_time_of_a_fall_from_one_metre():
     """sqrt(2 m / g) = 0.452 s: all four feet touch down at once, in the 23rd step (0.46 s)."""
     env = env_of(1, config=QUIET)
-    env._qpos[0, 2] = 1.0 + REACH
+    env._qpos[0, 2] = 1.0 + 0.2 * np.cos(0.8) + 0.2 * np.cos(0.7) + 0.02  # thigh, calf, foot
     for step in range(1, 25):
         *_, info = rest(env)
         assert env.touchdown.all() == env.touchdown.any() == (step == 23)
@@ -182,24 +161,21 @@ def test_air_time_of_a_fall_from_one_metre():
 
 
 def test_a_knee_on_the_ground_is_one_collision():
-    """The trunk one thigh above the ground: the front right calf lies on it, the other legs are
-    folded up."""
+    """The trunk one thigh above it: the front right calf lies on it, other legs are folded up."""
     env = env_of(1, config=QUIET)
-    angles = np.tile([0.0, 2.6, -2.69], (4, 1))
-    angles[0] = 0.0, 0.0, -np.pi / 2
+    angles = np.array([(0.0, 0.0, -np.pi / 2)] + 3 * [(0.0, 2.6, -2.69)])
     env._qpos[0, 2], env._qpos[0, 7:] = 0.2, angles.ravel()
-    *_, info = env.step((angles - np.array(A1.default_pose)).reshape(1, 12) / A1.action_scale)
+    *_, info = env.step((angles - A1.default_pose).reshape(1, 12) / A1.action_scale)
     assert env.link_contact.tolist() == [[False, True] + 6 * [False]]  # thigh, calf of FR, FL, ...
     assert info["rewards"]["collision"][0] == -1.0
 
 
 def test_a_push_redraws_the_horizontal_velocity_when_it_is_due():
-    pushed, calm = (
-        env_of(64, config=EnvConfig(push_seconds=0.1, push_speed=speed)) for speed in (1.0, 0.0)
-    )
+    pushed, calm = (env_of(64, config=EnvConfig(push_seconds=0.1, push_speed=x)) for x in (1, 0))
     for _ in range(5):
         assert np.array_equal(pushed._qvel, calm._qvel)  # until now, the same
-        rest(pushed), rest(calm)
+        rest(pushed)
+        rest(calm)
     assert np.array_equal(pushed._qvel[:, 2:], calm._qvel[:, 2:])
     velocity = pushed._qvel[:, :2]
     assert np.abs(velocity).max() <= 1 and np.abs(velocity.mean()) < 0.2
@@ -227,28 +203,21 @@ def test_friction_slows_a_sliding_robot():
     assert 2.0 - env._qvel[:, 1] == pytest.approx(friction * 9.81 * 3 * CONTROL_DT, rel=0.15)
 
 
-@pytest.mark.parametrize(
-    "when, value", [("before", np.nan), ("after", np.nan), ("after", np.inf), ("after", 1e4)]
-)
-def test_diverged_simulation_is_ended_counted_and_harms_nobody(
-    when, value, tmp_path, monkeypatch, capfd
-):
-    """Also of a state that runs away in the last substep: MuJoCo would warn in the next step, when
-    the numbers are in the buffer, or never."""
+@pytest.mark.parametrize("before, after", [(np.nan, 0), (0, np.nan), (0, np.inf), (0, 1e4)])
+def test_divergence_is_ended_counted_and_harms_nobody(before, after, tmp_path, monkeypatch, capfd):
+    """Before the step or in its last substep, of which MuJoCo would warn too late, or never."""
     monkeypatch.chdir(tmp_path)
     env, twin = env_of(3, config=QUIET), env_of(3, config=QUIET)
     step = env.world.step
 
     def run_away(**how):
-        if when == "before":
-            env._qvel[1, 7] = value
+        env._qvel[1, 7] += before
         step(**how)
-        if when == "after":
-            env._qvel[1, 7] = value
+        env._qvel[1, 7] += after
 
-    monkeypatch.setattr(env.world, "step", run_away)
+    env.world.step = run_away
     observation, reward, terminated, _, info = rest(env)
-    monkeypatch.undo()
+    env.world.step = step
     expected, *_ = rest(twin)
     assert info["diverged"].tolist() == [False, True, False] == terminated.tolist()
     fields = *observation, *info["final_observation"], *info["rewards"].values()
@@ -256,28 +225,26 @@ def test_diverged_simulation_is_ended_counted_and_harms_nobody(
         assert (np.abs(x) < 1000).all()
     assert reward[1] == 0 and info["episode_returns"].tolist() == [0]
     assert np.array_equal(observation.legs[[0, 2]], expected.legs[[0, 2]])
+
     _, _, terminated, _, info = rest(env)
     assert not info["diverged"].any() and not terminated.any()
     assert not list(tmp_path.iterdir()) and capfd.readouterr().err == ""  # MuJoCo says nothing
 
 
-# One robot, every number chosen so that each term can be worked out in the head.
-BY_HAND = SimpleNamespace(
-    command=np.array([[0.5, 0.0, 0.2]]),
-    linear_velocity=np.array([[0.2, 0.4, 0.3]]),  # error (-0.3, 0.4): squared norm 0.25
-    angular_velocity=np.array([[0.1, -0.2, 0.7]]),  # yaw error 0.5: squared 0.25
-    link_contact=np.array([[True, False, False, True, False, False, False, True]]),
-    torque=np.full((1, 4, 3), 2.0),  # 12 * 4 = 48
-    action=np.full((1, 4, 3), 0.5),
-    last_action=np.full((1, 4, 3), 0.4),  # 12 * 0.01 = 0.12
-    touchdown=np.array([[True, False, True, False]]),
-    air_time=np.array([[0.7, 0.9, 0.4, 0.0]]),  # (0.7 - 0.5) + (0.4 - 0.5) = 0.1
-    joint_error=np.full((1, 4, 3), -0.1),  # 12 * 0.01 = 0.12
-)
-
-
 def test_reward_terms_by_hand_scaled_by_time_and_floored_and_standing_earns_no_air_time():
-    bad, terms = rewards.total_reward(BY_HAND, 0.02)
+    state = SimpleNamespace(
+        command=np.array([[0.5, 0.0, 0.2]]),
+        linear_velocity=np.array([[0.2, 0.4, 0.3]]),  # error (-0.3, 0.4): squared norm 0.25
+        angular_velocity=np.array([[0.1, -0.2, 0.7]]),  # yaw error 0.5: squared 0.25
+        link_contact=np.array([[True, False, False, True, False, False, False, True]]),
+        torque=np.full((1, 4, 3), 2.0),  # 12 * 4 = 48
+        action=np.full((1, 4, 3), 0.5),
+        last_action=np.full((1, 4, 3), 0.4),  # 12 * 0.01 = 0.12
+        touchdown=np.array([[True, False, True, False]]),
+        air_time=np.array([[0.7, 0.9, 0.4, 0.0]]),  # (0.7 - 0.5) + (0.4 - 0.5) = 0.1
+        joint_error=np.full((1, 4, 3), -0.1),  # 12 * 0.01 = 0.12
+    )
+    reward, terms = rewards.total_reward(state, 0.02)
     assert {name: term[0] for name, term in terms.items()} == pytest.approx({
         "xy_velocity_tracking": 1.5 * np.exp(-1),
         "yaw_velocity_tracking": 0.5 * np.exp(-1),
@@ -289,9 +256,10 @@ def test_reward_terms_by_hand_scaled_by_time_and_floored_and_standing_earns_no_a
         "foot_air_time": 1.0 * 0.1,
         "joint_error": -0.04 * 0.12,
     })  # fmt: skip
-    assert bad[0] == 0.0
-    good = SimpleNamespace(**(vars(BY_HAND) | {"link_contact": np.zeros((1, 8), bool)}))
-    reward, terms = rewards.total_reward(good, 0.02)
+    assert reward[0] == 0.0
+
+    state.link_contact[:] = False
+    reward, terms = rewards.total_reward(state, 0.02)
     assert reward[0] == pytest.approx(0.02 * sum(t[0] for t in terms.values())) and reward[0] > 0
-    still = SimpleNamespace(**(vars(BY_HAND) | {"command": np.array([[0.0, 0.05, 0.9]])}))
-    assert rewards.total_reward(still, 0.02)[1]["foot_air_time"][0] == 0.0
+    state.command = np.array([[0.0, 0.05, 0.9]])
+    assert rewards.total_reward(state, 0.02)[1]["foot_air_time"][0] == 0.0

@@ -1,5 +1,4 @@
-"""A policy that was taken away answers as it did and walks without this repository; the env as
-other libraries want it."""
+"""Policies that walk without this repository; the env as other libraries want it."""
 
 import json
 import subprocess

@@ -1,31 +1,24 @@
 """PPO's mathematics by hand, and the masks' way from the rollout into the update."""
 
 import copy
-import math
 from pathlib import Path
 
 import pytest
 import torch
 import torch.distributed as dist
 import torch.multiprocessing as mp
+from torch.distributions import Normal, kl_divergence
 
 from conftest import env_of, fresh_policy, ratio, rollout_of
 from env import EnvConfig
-from faults import TASKS
-from ppo import (
-    Critic, Learner, PPOConfig, RolloutBuffer, adapt_learning_rate, collect, compute_gae, ppo_loss,
-    to_tensors,
-)  # fmt: skip
-
-
-def column(*values):
-    return torch.tensor(values, dtype=torch.float32)[:, None]
+from ppo import Learner, PPOConfig, RolloutBuffer
+from ppo import adapt_learning_rate, collect, compute_gae, ppo_loss, to_tensors
 
 
 def test_gae_by_hand():
     """gamma 0.5, lambda 0.5. Three robots in step 1: one lives on, one dies, one's time is out."""
-    none, middle = torch.zeros(3, 1, dtype=torch.bool), torch.tensor([[False], [True], [False]])
-    reward, value, following = column(1, 2, 3), column(4, 8, 16), column(8, 16, 32)
+    none, middle = torch.tensor([[False] * 3, [False, True, False]])[:, :, None]
+    reward, value, following = torch.tensor([[1.0, 2, 3], [4, 8, 16], [8, 16, 32]])[:, :, None]
 
     def gae(terminated, truncated):
         advantage = compute_gae(reward, value, following, terminated, truncated, 0.5, 0.5)
@@ -42,17 +35,15 @@ def test_gae_by_hand():
 def test_loss_by_hand():
     config = PPOConfig(clip=0.2, value_weight=0.5)
     # ratios 1, 2 (clipped to 1.2), 0.5 (with a bad action: to 0.8), 0.5 (with a good one: not)
-    log_prob = torch.tensor([0.0, math.log(2), math.log(0.5), math.log(0.5)])
-    advantage = torch.tensor([1.0, 1.0, -1.0, 1.0])
+    log_prob, advantage = torch.tensor([1.0, 2, 0.5, 0.5]).log(), torch.tensor([1.0, 1, -1, 1])
     # value errors: 1; clipped 0.2 from old instead of 2 away: 3 - 1.8; ...
-    value, target = torch.tensor([1.0, 2.0, 0.1, 0.0]), torch.tensor([0.0, 2.0, 0.0, 0.0])
+    value, target = torch.tensor([[1.0, 2, 0.1, 0], [0, 2, 0, 0]])
     old, entropy = torch.zeros(4), torch.full((4,), 5.0)
     loss, parts = ppo_loss(log_prob, old, advantage, value, old, target, entropy, 0.1, config)
     surrogate = -(1 + 1.2 - 0.8 + 0.5) / 4
     value_loss = (1 + 1.8**2 + 0.1**2 + 0) / 4
-    assert parts["surrogate"].item() == pytest.approx(surrogate)
-    assert parts["value_loss"].item() == pytest.approx(value_loss)
-    assert parts["clip_fraction"].item() == 0.75
+    by_hand = {"surrogate": surrogate, "value_loss": value_loss, "clip_fraction": 0.75}
+    assert {name: part.item() for name, part in parts.items()} == pytest.approx(by_hand)
     assert loss.item() == pytest.approx(surrogate + 0.5 * value_loss - 0.1 * 5)
 
 
@@ -65,87 +56,74 @@ def test_learning_rate_follows_the_kl():
     assert adapt_learning_rate(1e-2, 1e-4, 0.01) == 1e-2
 
 
-def rollout(n=8, precision="fp32"):
-    run, generator = rollout_of(fresh_policy("rolt"), n=n, precision=precision)
-    return run.actor, run.critic, run.buffer, generator
-
-
 def test_ratio_is_one_with_replayed_masks_and_not_with_fresh_ones():
     """The reason for consistent dropout, on a real rollout before any weight has moved."""
-    policy, _, buffer, generator = rollout()
-    same = buffer.minibatch(torch.arange(80, 88))  # step 10 of all 8 robots: the batch that acted
-    assert torch.equal(ratio(policy, same, buffer.std, same["masks"]), torch.ones(8))  # to the bit
-    order = torch.randperm(len(buffer), generator=generator)[:64]
-    batch = buffer.minibatch(order)  # in another order sums are rounded differently, no more
-    assert (ratio(policy, batch, buffer.std, batch["masks"]) - 1).abs().max() < 1e-4
-    fresh = ratio(policy, batch, buffer.std, policy.sample_masks(64, generator))
-    assert (fresh - 1).abs().median() > 0.1
+    run = rollout_of(fresh_policy("rolt"))
+    same = run.buffer.minibatch(torch.arange(80, 88))  # step 10 of all 8 robots, acting at once
+    assert torch.equal(ratio(run, same), torch.ones(8))  # to the bit
+    order = torch.randperm(len(run.buffer), generator=run.generator)[:64]
+    batch = run.buffer.minibatch(order)  # in another order sums are rounded differently, no more
+    assert (ratio(run, batch) - 1).abs().max() < 1e-4
+    batch["masks"] = run.actor.sample_masks(64, run.generator)
+    assert (ratio(run, batch) - 1).abs().median() > 0.1
 
 
 def test_ratio_is_one_in_bf16_too():
-    policy, _, buffer, generator = rollout(64, "bf16")
-    batch = buffer.minibatch(torch.randperm(len(buffer), generator=generator)[:500])
-    rounded, exact = (ratio(policy, batch, buffer.std, batch["masks"], x) for x in (True, False))
-    assert (rounded - 1).abs().max() < 1e-2
-    assert (exact - 1).abs().max() > 1e-4  # it was bf16 that acted
+    run = rollout_of(fresh_policy("rolt"), n=64, precision="bf16")
+    batch = run.buffer.minibatch(torch.randperm(len(run.buffer), generator=run.generator)[:500])
+    assert (ratio(run, batch) - 1).abs().max() < 1e-2
+    run.learner.bf16 = False
+    assert (ratio(run, batch) - 1).abs().max() > 1e-4  # it was bf16 that acted
 
 
 @torch.no_grad()
 def test_the_critic_sees_what_policies_do_not():
-    """Another friction, another fault: another value, the same actions. Noise on heights is the
-    policy's alone."""
-    policy, generator = fresh_policy("mlp", "terrain", True), torch.Generator().manual_seed(0)
-    env = env_of(4, extras=("privileged", "heights"), terrain=TASKS["terrain"].terrain)
-    observation = env.observe()
-    critic, masks = Critic(observation), policy.sample_masks(4, generator)
-    seen = to_tensors(observation, "cpu")
+    """Another fault: another value, the same actions. Noise on heights is the policy's alone."""
+    run = rollout_of(fresh_policy("mlp", "terrain", True), task="terrain")
+    policy, critic, batch = run.actor, run.critic, run.buffer.minibatch(torch.arange(8))
+    seen, noise = batch["observation"], batch["masks"]["height_noise"]
     told = seen._replace(privileged=seen.privileged + 1)
     assert torch.equal(policy(told), policy(seen)) and not torch.equal(critic(told), critic(seen))
-    assert masks["height_noise"].std().item() == pytest.approx(20 * 0.06, rel=0.1)
-    assert not torch.equal(policy(seen, masks), policy(seen))
-    buffer = RolloutBuffer(4, observation, 12, masks, "cpu")
-    collect(env, policy, critic, buffer, observation, generator)
-    batch = buffer.minibatch(torch.arange(16))
-    assert torch.equal(batch["value"], critic(batch["observation"]))  # of what is stored: clean
-    assert torch.equal(buffer.observation.heights[0], seen.heights)
-    same = ratio(policy, batch, buffer.std, batch["masks"])
-    assert torch.allclose(same, torch.ones(16), atol=1e-4)
+    assert noise.std().item() == pytest.approx(20 * 0.06, rel=0.1)
+    assert not torch.equal(policy(seen, batch["masks"]), policy(seen))
+    assert torch.equal(batch["value"], critic(seen))  # of what is stored: clean
+    assert torch.equal(seen.heights, to_tensors(run.observation, "cpu").heights)
+    assert torch.allclose(ratio(run, batch), torch.ones(8), atol=1e-4)
 
 
 def test_update_is_ppo_as_one_would_write_it_down():
-    """Two epochs of three minibatches, half of the training done: minibatches, masks, entropy,
-    clipping by plain autograd."""
-    policy, critic, buffer, generator = rollout()
+    """Two epochs of three minibatches, half of the training done, by plain autograd."""
+    run = rollout_of(fresh_policy("rolt"))
+    policy, critic, buffer, generator = run.actor, run.critic, run.buffer, run.generator
     plain_policy, plain_critic = copy.deepcopy((policy, critic))
     start = [p.clone() for module in (policy, critic) for p in module.parameters()]
     order = torch.Generator().set_state(generator.get_state())
     config = PPOConfig(epochs=2, minibatches=3, max_gradient_norm=15.0)
-    learner = Learner(policy, critic, config)
-    stats = learner.update(buffer, generator, progress=0.5)
+    stats = Learner(policy, critic, config).update(buffer, generator, progress=0.5)
 
     parameters = [*plain_policy.parameters(), *plain_critic.parameters()]
-    groups = (plain_policy, 1e-4), (plain_critic, 1e-3)
-    groups = [{"params": module.parameters(), "lr": rate} for module, rate in groups]
-    optimizer, norms, kls = torch.optim.Adam(groups), [], []
-    Normal, entropy_weight = torch.distributions.Normal, 0.5 * config.entropy_weight
+    optimizer = torch.optim.Adam(plain_policy.parameters(), lr=1e-4)
+    optimizer.add_param_group({"params": plain_critic.parameters(), "lr": 1e-3})
+    advantages = (buffer.returns - buffer.value).flatten()  # before they are normalised
+    advantages = (advantages - advantages.mean()) / advantages.std(correction=0)
+    norms, kls = [], []
     for _ in range(2):
         for index in torch.randperm(24 * 8, generator=order).split(64):
             batch = buffer.minibatch(index)
             seen, old = batch["observation"], Normal(batch["mean"], buffer.std)
             new = Normal(plain_policy(seen, batch["masks"]), plain_policy.std())
             log_prob, entropy = new.log_prob(batch["action"]).sum(1), new.entropy().sum(1)
-            advantage = (buffer.returns - buffer.value).flatten()  # before it was normalised
-            advantage = ((advantage - advantage.mean()) / advantage.std(correction=0))[index]
             loss, _ = ppo_loss(
-                log_prob, batch["log_prob"], advantage, plain_critic(seen), batch["value"],
-                batch["returns"], entropy, entropy_weight, config,
+                log_prob, batch["log_prob"], advantages[index], plain_critic(seen), batch["value"],
+                batch["returns"], entropy, 0.5 * config.entropy_weight, config,
             )  # fmt: skip
             optimizer.zero_grad()
             loss.backward()
             norm = torch.nn.utils.clip_grad_norm_(parameters, config.max_gradient_norm)
             optimizer.step()
             norms.append(norm.item())
-            kls.append(torch.distributions.kl_divergence(old, new).sum(1).mean().item())
+            kls.append(kl_divergence(old, new).sum(1).mean().item())
+
     assert min(norms) < config.max_gradient_norm < max(norms)  # some were clipped
     trained = [*policy.named_parameters(), *critic.named_parameters()]
     for (name, ours), plain, before in zip(trained, parameters, start):
@@ -155,24 +133,23 @@ def test_update_is_ppo_as_one_would_write_it_down():
     assert stats["learning_rate"] == adapt_learning_rate(1e-4, stats["kl"], config.target_kl)
 
 
+@torch.no_grad()
 def test_the_buffer_holds_what_the_env_answered():
     """A twin of the env is given the same actions. One of three robots begins on its back."""
-    policy, critic, _, generator = rollout()
+    run = rollout_of(fresh_policy("rolt"))
     how = {"config": EnvConfig(episode_seconds=0.1), "extras": ("privileged",)}
     env, twin = env_of(3, **how), env_of(3, **how)
     observation = env.observe()
     for world in (env, twin):
         world._qpos[1, 2:7] = [0.5, 0, 1, 0, 0]
-    buffer = RolloutBuffer(8, observation, 12, policy.sample_masks(3, generator), "cpu")
-    following, _ = collect(env, policy, critic, buffer, observation, generator)
+    buffer = RolloutBuffer(8, observation, 12, run.actor.sample_masks(3, run.generator), "cpu")
+    following, _ = collect(env, run.actor, run.critic, buffer, observation, run.generator)
     for t in range(8):
-        seen, reward, terminated, truncated, info = twin.step(buffer.action[t].numpy())
-        assert buffer.reward[t].tolist() == reward.tolist()
-        assert buffer.terminated[t].tolist() == terminated.tolist()
-        assert buffer.truncated[t].tolist() == truncated.tolist()
-        if truncated.any():  # bootstrapped from the true last observation
-            with torch.no_grad():
-                true_value = critic(to_tensors(info["final_observation"], "cpu"))
+        seen, *answer, info = twin.step(buffer.action[t].numpy())
+        for stored, true in zip((buffer.reward, buffer.terminated, buffer.truncated), answer):
+            assert stored[t].tolist() == true.tolist()
+        if buffer.truncated[t].any():  # bootstrapped from the true last observation
+            true_value = run.critic(to_tensors(info["final_observation"], "cpu"))
             assert torch.allclose(buffer.next_value[t, info["truncated_ids"]], true_value)
             assert not torch.allclose(buffer.next_value[t], buffer.value[t + 1])
     assert buffer.terminated[0].tolist() == [False, True, False]
@@ -180,24 +157,23 @@ def test_the_buffer_holds_what_the_env_answered():
     assert torch.equal(buffer.next_value[3], buffer.value[4])  # inside an episode: the next one
     assert (following.legs == seen.legs).all()
     last = buffer.next_value[-1]
-    with torch.no_grad():
-        assert torch.equal(last, critic(to_tensors(seen, "cpu"))) and last.abs().min() > 0
+    assert torch.equal(last, run.critic(to_tensors(seen, "cpu"))) and last.abs().min() > 0
 
 
 def test_a_gradient_that_is_not_finite_stops_training_before_it_reaches_a_weight():
-    policy, critic, buffer, generator = rollout()
-    buffer.observation.legs[5] = float("nan")
+    run = rollout_of(fresh_policy("rolt"))
+    run.buffer.observation.legs[5] = float("nan")
     with pytest.raises(FloatingPointError, match="a gradient is not finite"):
-        Learner(policy, critic, PPOConfig()).update(buffer, generator)
-    state = policy.state_dict() | critic.state_dict()  # moved by good minibatches before, perhaps
+        run.learner.update(run.buffer, run.generator)
+    state = run.actor.state_dict() | run.critic.state_dict()  # moved by good minibatches, perhaps
     assert all(torch.isfinite(p).all() for p in state.values())
 
 
 def updated(world_size: int, rank: int = 0) -> dict:
-    """One update, with a single minibatch, on this rank's share of a rollout that was of another
-    policy: its means and probabilities are moved."""
+    """One update on this rank's share of a rollout of another policy: its means are moved."""
     torch.set_num_threads(1)
-    policy, critic, buffer, _ = rollout()
+    run = rollout_of(fresh_policy("rolt"))
+    buffer = run.buffer
     buffer.mean += 0.1
     buffer.log_prob += torch.rand(buffer.log_prob.shape)
     mine = slice(rank * 8 // world_size, (rank + 1) * 8 // world_size)
@@ -206,11 +182,11 @@ def updated(world_size: int, rank: int = 0) -> dict:
     for name in "action mean log_prob reward value next_value terminated truncated".split():
         setattr(buffer, name, getattr(buffer, name)[:, mine])
 
-    learner = Learner(policy, critic, PPOConfig(epochs=1, minibatches=1))
+    learner = Learner(run.actor, run.critic, PPOConfig(epochs=1, minibatches=1))
     stats = learner.update(buffer, torch.Generator().manual_seed(rank))
     gradient = torch.cat([p.grad.flatten() for p in learner.parameters])
     result = {"gradient": gradient, "learning_rate": learner.optimizer.param_groups[0]["lr"]}
-    return result | {"stats": stats, "weights": policy.state_dict()}
+    return result | {"stats": stats, "weights": run.actor.state_dict()}
 
 
 def rank_of_two(rank: int, folder: str) -> None:
@@ -227,8 +203,7 @@ def test_two_ranks_of_half_the_robots_follow_one_rank_of_all(tmp_path):
     first, second = (torch.load(tmp_path / f"{rank}.pt") for rank in (0, 1))
     one = updated(1)
     assert torch.equal(first["gradient"], second["gradient"]) and first["stats"] == second["stats"]
-    for name in one["weights"]:
-        assert torch.equal(first["weights"][name], second["weights"][name])
+    assert all(map(torch.equal, first["weights"].values(), second["weights"].values()))
     assert one["gradient"].norm() > 0.1
     assert torch.allclose(first["gradient"], one["gradient"], atol=1e-5)
     assert first["learning_rate"] == one["learning_rate"] != PPOConfig.learning_rate  # moved by KL

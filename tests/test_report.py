@@ -23,7 +23,7 @@ def table(**shares) -> list[dict]:
     return rows
 
 
-def test_a_cell_is_the_mean_over_seeds_of_the_mean_over_episodes():
+def test_a_cell_is_the_mean_over_seeds_of_the_mean_over_episodes_its_interval_a_binomials():
     """Seed 0: 1 and 3; seed 1: 7 and 9. 2 and 8, hence 5; a drawn mean of seeds is 1 to 9."""
     rows = table(rolt={"FR": [[1, 3], [7, 9]]}, mlp={"FR": [[100], [100]]})
     seeds = report.by_seed(rows, "share", method="rolt", case="FR")
@@ -32,10 +32,7 @@ def test_a_cell_is_the_mean_over_seeds_of_the_mean_over_episodes():
     assert mean == 5 and 1 <= low < 2 < 8 < high <= 9  # both seeds the same one: 1 in 4 draws
     assert report.by_seed(rows, "share", case="RL") == []
 
-
-def test_the_interval_of_seeds_is_a_binomials():
-    """Two of five seeds reach 1: of five drawn, 0 to 4 do in 95 %."""
-    seeds = [np.full(4, x) for x in (0.0, 0, 0, 1, 1)]
+    seeds = [np.full(4, x) for x in (0.0, 0, 0, 1, 1)]  # of five drawn, 0 to 4 reach 1 in 95 %
     assert report.mean_and_interval(seeds) == pytest.approx((0.4, 0.0, 0.8))
 
 
@@ -77,7 +74,7 @@ def test_a_verdict_takes_three_seeds_and_an_interval_off_zero():
     assert words.startswith("+0.17") and (verdict, needed) == ("undecided", "47")
 
 
-def test_the_claims_leave_out_who_is_untrained_and_legs_that_hang(tmp_path, capsys):
+def test_claims_and_comparisons_leave_out_who_is_untrained_and_legs_that_hang(tmp_path, capsys):
     rows = table(rolt={"FR": WELL, "RR": WELL, "RL": WELL},
                  mlp={"FR": WELL, "RR": [[0.1, 0.1]] * 3, "RL": WELL},
                  rma={"FR": SLOW, "RR": WELL, "RL": WELL})  # fmt: skip
@@ -88,6 +85,11 @@ def test_the_claims_leave_out_who_is_untrained_and_legs_that_hang(tmp_path, caps
     assert "| mlp | +1.00 (+1.00 to +1.00) | 3, 3 | shows | - |" in lines[3]  # RL does not count
     assert "| rma | | | rma: not trained | - |" in lines[4] and "roam: no data" in lines[5]
 
+    report.compare(rows, {"unseen": ["RR", "RL"]})
+    head, _, rolt, mlp = capsys.readouterr().out.strip().splitlines()
+    assert head.startswith("| unseen (RR) |")
+    assert rolt == "| rolt | 0.90 | | |" and mlp == "| mlp | 0.10 | 100% | - |"
+
 
 def test_noise_is_measured_by_what_is_kept():
     rows = table(rolt={"FR": [[0.8, 0.8]], "RR": [[0.4, 0.2]]})
@@ -95,14 +97,7 @@ def test_noise_is_measured_by_what_is_kept():
     assert report.measured(rows, "rolt", claim, ["RR"])[0] == pytest.approx([0.5, 0.25])
 
 
-def test_a_comparison_leaves_out_who_is_untrained_and_gives_no_p_to_few_seeds(capsys):
-    rows = table(rolt={"FR": WELL, "RR": WELL, "RL": WELL},
-                 mlp={"FR": WELL, "RR": SLOW, "RL": SLOW},
-                 rma={"FR": SLOW, "RR": WELL, "RL": WELL})  # fmt: skip
-    report.compare(rows, {"unseen": ["RR", "RL"]})
-    head, _, rolt, mlp = capsys.readouterr().out.strip().splitlines()
-    assert head.startswith("| unseen (RR) |")  # of RL the MLP's leg hangs
-    assert rolt == "| rolt | 0.90 | | |" and mlp == "| mlp | 0.50 | 100% | - |"
+def test_a_comparison_gives_a_p_to_five_seeds_or_more(capsys):
     rows = table(rolt={"FR": WELL * 2, "RR": WELL * 2}, roam={"FR": WELL * 2, "RR": SLOW * 2})
     report.compare(rows, {"unseen": ["RR"]})
     assert capsys.readouterr().out.strip().endswith("| roam | 0.50 | 100% | 0.002 |")  # 2 of 924

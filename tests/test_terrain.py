@@ -1,6 +1,7 @@
 """The ground, the scandots that read it, their noise, and the curriculum."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import mujoco
 import numpy as np
@@ -13,22 +14,22 @@ from robots import A1, build_model
 from terrain import KINDS, TRAINING_MAP, Terrain, rise
 
 STAIRS = Terrain(("stairs",), (3,))  # steps of 0.104 m and 0.31 m that begin at x = 0.5
+RAMP = SimpleNamespace(height=lambda x, y: x)  # ground as high as x, everywhere
 STILL = replace(QUIET, forward_speed=(0.0, 0.0), start_rows=1, climb=False)
 
 
-def test_height_is_where_rays_end():
+def test_height_is_where_rays_end(rng):
     terrain = Terrain((*KINDS, "stairs"), (0, 4, 10))
     model = build_model(A1, terrain)
-    data, rng = mujoco.MjData(model), np.random.default_rng(0)
+    data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
     x, y = rng.uniform(-2, 27, 4000), rng.uniform(-6, 8 * len(terrain.columns), 4000)
     geom, trunk = np.zeros(1, dtype=np.int32), model.body("trunk").id
-    down, straight = [], [0, 0, -1.0]
-    for a, b in zip(x, y):
-        down.append(mujoco.mj_ray(model, data, [a, b, 9.0], straight, None, 1, trunk, geom, None))
+    how = [0, 0, -1.0], None, 1, trunk, geom, None  # straight down, past the robot's trunk
+    down = np.array([mujoco.mj_ray(model, data, [a, b, 9.0], *how) for a, b in zip(x, y)])
     away = np.hypot(x, y) > 1  # from the robot's legs
     height = terrain.height(x, y)
-    assert np.allclose(9.0 - np.array(down)[away], height[away], atol=1e-6)
+    assert np.allclose(9.0 - down[away], height[away], atol=1e-6)
     for column, kind in enumerate(terrain.columns):
         assert (height[np.abs(y - 8 * column) < 3.5] > 0).any() == (kind != "flat")
     assert height.max() == pytest.approx(6 * rise(10))
@@ -40,20 +41,19 @@ def test_stairs_by_hand():
     assert np.allclose(STAIRS.height(x, np.full(9, 3.6)), 0)  # the strip beside them
 
 
-class Ramp:
-    """Ground as high as x, everywhere."""
-
-    def height(self, x, y):
-        return x
-
-
-def test_the_scan_turns_with_the_robot():
-    ahead, turned = scan(Ramp(), np.array([[0, 0, 0.3]] * 2), np.array([0, np.pi / 2])) / 20
-    assert ahead.shape == (16, 12)
+def test_the_scan_turns_with_the_robot_and_a_shift_reads_the_ground_elsewhere():
+    """On a ramp a point read 0.2 m further ahead is 0.2 m higher; a vertical shift is anywhere."""
+    position, yaw = np.array([[0, 0, 0.3]] * 2), np.array([0, np.pi / 2])
+    ahead, turned = scan(RAMP, position, yaw) / 20
     assert np.allclose(ahead[:, 0], np.linspace(0.75, -0.75, 16))  # it rises to the front
     assert np.allclose(ahead, ahead[:, :1])
     assert np.allclose(turned[0], np.linspace(-0.55, 0.55, 12))  # and, facing left, to the right
     assert np.allclose(turned, turned[:1])
+
+    further, up = np.eye(3)[[0, 2]] * 0.2
+    assert np.allclose(scan(RAMP, position, yaw, further)[0] / 20, np.clip(ahead - 0.2, -1, 1))
+    assert np.allclose(scan(None, position, yaw, further), 0)
+    assert np.allclose(scan(None, position, yaw, up), -4)
 
 
 def test_the_env_reads_the_ground_around_its_robots():
@@ -65,18 +65,15 @@ def test_the_env_reads_the_ground_around_its_robots():
     assert np.allclose(heights[:, 13:], (z - 0.3 - rise(3))[:, None, None])  # ahead: the first step
 
 
-def test_unknown_ground_and_noise_are_refused():
-    with pytest.raises(ValueError, match="unknown kind of terrain lava; there is flat, slope"):
-        Terrain(("lava",), (0,))
-    for text in ("fog", "sigma", "sigma:-1", "sigma:nan", "missing:13", "missing:1.5", ""):
-        with pytest.raises(ValueError, match="write clean, offset:0.3"):
-            parse_noise(text)
-
-
-def test_noise_is_read_from_words():
+def test_noise_is_read_from_words_and_unknown_ground_and_noise_are_refused():
     assert parse_noise("clean") == ScanNoise()
     noise = ScanNoise(offset=0.3, missing=4, sigma=0.1)
     assert parse_noise("offset:0.3+missing:4+sigma:0.1") == noise
+    for text in ("fog", "sigma", "sigma:-1", "sigma:nan", "missing:13", "missing:1.5", ""):
+        with pytest.raises(ValueError, match="write clean, offset:0.3"):
+            parse_noise(text)
+    with pytest.raises(ValueError, match="unknown kind of terrain lava; there is flat, slope"):
+        Terrain(("lava",), (0,))
 
 
 def drawn(n: int, noise: str) -> NoisyScan:
@@ -85,25 +82,18 @@ def drawn(n: int, noise: str) -> NoisyScan:
     return scan
 
 
-def by_patch(points: np.ndarray) -> np.ndarray:
-    """(n, 16, 12, ...) -> (n, 12, 16, ...), 16 points of each of ROLT's patches."""
-    n, more = len(points), points.shape[3:]
-    squares = points.reshape(n, 4, 4, 3, 4, *more).swapaxes(2, 3)
-    return squares.reshape(n, 12, 16, *more)
-
-
 def test_low_frequency_noise_moves_whole_patches_by_its_scale_and_missing_ones_are_whole():
-    shifts = drawn(2000, "offset:0.3").shift
-    patches = by_patch(shifts)
-    assert np.array_equal(patches, np.repeat(patches[:, :, :1], 16, axis=2))
-    moved = np.linalg.norm(patches[:, :, 0], axis=2)
-    assert np.all((moved > 0).sum(axis=1) == 4) and np.allclose(moved[moved > 0], 0.3)
-    directions = patches[:, :, 0][moved > 0] / 0.3  # 8000, uniform on the sphere
+    shifts, missing = drawn(2000, "offset:0.3").shift, drawn(50, "missing:4").missing
+    assert np.array_equal(shifts, drawn(2000, "offset:0.3").shift)
+    shift, gone = (points[:, ::4, ::4] for points in (shifts, missing))  # of each patch
+    assert np.array_equal(shifts, shift.repeat(4, axis=1).repeat(4, axis=2))
+    assert np.array_equal(missing, gone.repeat(4, axis=1).repeat(4, axis=2))
+    assert np.all(gone.sum(axis=(1, 2)) == 4)
+    moved = np.linalg.norm(shift, axis=3)
+    assert np.all((moved > 0).sum(axis=(1, 2)) == 4) and np.allclose(moved[moved > 0], 0.3)
+    directions = shift[moved > 0] / 0.3  # 8000, uniform on the sphere
     assert np.allclose(directions.mean(0), 0, atol=0.03)
     assert np.allclose(directions.var(0), 1 / 3, atol=0.02)
-    assert np.array_equal(shifts, drawn(2000, "offset:0.3").shift)
-    missing = by_patch(drawn(50, "missing:4").missing)
-    assert np.array_equal(missing.all(2), missing.any(2)) and np.all(missing.all(2).sum(1) == 4)
 
 
 def test_high_frequency_noise_has_its_scale_and_no_order():
@@ -113,21 +103,10 @@ def test_high_frequency_noise_has_its_scale_and_no_order():
     flat = noisy.read(ids, position, yaw) / 20
     assert np.abs(flat.mean(axis=0)).mean() < 0.01 and flat.std() == pytest.approx(0.1, rel=0.02)
     assert abs(np.corrcoef(flat[:, 0, 0], flat[:, 0, 1])[0, 1]) < 0.3
-    noisy.terrain = Ramp()
+    noisy.terrain = RAMP
     ramp = noisy.read(ids, position, yaw)[:, 6:10] / 20  # amid the scan, where nothing is clipped
-    expected = scan(Ramp(), position, yaw)[:, 6:10] / 20
+    expected = scan(RAMP, position, yaw)[:, 6:10] / 20
     assert (ramp - expected).std() == pytest.approx(0.1 * 2**0.5, rel=0.03)
-
-
-def test_a_lateral_shift_reads_the_ground_elsewhere():
-    """On a ramp a point read 0.2 m further ahead is 0.2 m higher; a vertical shift is anywhere."""
-    position, yaw, shift = np.array([[0, 0, 0.3]]), np.array([0.0]), np.zeros((1, 16, 12, 3))
-    clean = scan(Ramp(), position, yaw)
-    shift[..., 0] = 0.2
-    assert np.allclose(scan(Ramp(), position, yaw, shift), np.clip(clean - 4, -20, 20), atol=1e-6)
-    assert np.allclose(scan(None, position, yaw, shift), 0)
-    shift[..., 2], shift[..., 0] = 0.2, 0
-    assert np.allclose(scan(None, position, yaw, shift), -4)
 
 
 def test_noise_changes_the_scan_and_nothing_else():
@@ -142,11 +121,11 @@ def test_noise_changes_the_scan_and_nothing_else():
     assert all((scan == 0).sum() >= 2 * 16 for scan in noisy.heights)
 
 
-def test_curriculum_by_hand():
+def test_curriculum_by_hand(rng):
     """Episodes of 20 s at 0.5 m/s: 10 m commanded, half of it 5 m; half a tile is 4 m."""
     row, distance = np.array([1, 1, 0, 1, 6]), np.array([4.1, 3.9, 1.0, 0.5, 9.0])
     speed = np.array([0.5, 0.5, 0.5, 0.0, 0.5])  # the fourth is told to stand
-    after = TRAINING_MAP.next_row(row, distance, 20.0 * speed, np.random.default_rng(0))
+    after = TRAINING_MAP.next_row(row, distance, 20.0 * speed, rng)
     assert list(after[:4]) == [2, 0, 0, 1]
     assert 0 <= after[4] < 7  # after the last level, any
 

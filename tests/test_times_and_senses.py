@@ -10,27 +10,27 @@ from robots import A1, build_model
 
 ALL = (
     "lock:FR_calf@0.1:0.2+payload:trunk:2@0.1:0.2+blow:trunk:3@0.14:+late:RL:0.02@0.1:0.2"
-    "+bias:FL:0.2@0.1:0.2+freeze:RR@0.1:0.2+weaken:FL:0.5@0.1:0.2"
+    "+bias:FL:0.2@0.1:0.2+freeze:RR@0.1:0.2+weaken:FL:0.5@0.1:0.2+mute:RL@0.1:0.2"
 )
 
 
-def test_a_fault_strikes_and_goes_to_the_step():
+def test_a_fault_strikes_and_goes_to_the_step_and_critics_are_told(rng):
     """0.1 s is 5 steps, 0.2 s 10; the next episode begins healthy."""
-    env, rng = env_with("lock:FR_calf@0.1:0.2", HEALTHY), np.random.default_rng(0)
-    seen = []
-    for _ in range(12):
-        flail(env, rng)
-        seen.append(env.world.bind("eq_active")[:, 2].tolist())
-    assert seen == [[0, 0]] * 5 + [[1, 0]] * 5 + [[0, 0]] * 2
+    fault, bias = "lock:FR_calf@0.1:0.2+payload:trunk:2@0.1:0.2", "bias:FL:0.2"
+    env = env_with(fault, bias, extras=("privileged",))
+    told = np.array([flail(env, rng)[0].privileged[:, [2, -2, -1]] for _ in range(12)])
+    assert told[:, 0].tolist() == [[0, 0, 0]] * 5 + [[1, 0, 2]] * 5 + [[0, 0, 0]] * 2
+    assert np.allclose(told[:, 1], [0, 0.2, 0])
+
     for _ in range(8):
         env.reset()
-        assert not env.world.bind("eq_active").any() and env.fault_now == [HEALTHY] * 2
+        assert not env.world.bind("eq_active").any() and env.fault_now == [HEALTHY, bias]
         flail(env, rng, 6)
-        assert env.fault_now == ["lock:FR_calf", HEALTHY]
+        assert env.fault_now == ["lock:FR_calf+payload:trunk:2", bias]
 
 
-def test_a_lock_that_strikes_holds_where_it_is_also_when_another_fault_comes():
-    env, rng = env_with("lock:FR_calf@0.1:+weaken:RL:0.5@0.2:"), np.random.default_rng(0)
+def test_a_lock_that_strikes_holds_where_it_is_also_when_another_fault_comes(rng):
+    env = env_with("lock:FR_calf@0.1:+weaken:RL:0.5@0.2:")
     flail(env, rng, 5)
     before = env.joint_error[0, 0, 2]
     flail(env, rng)
@@ -40,27 +40,22 @@ def test_a_lock_that_strikes_holds_where_it_is_also_when_another_fault_comes():
     assert abs(before) > 0.03 and env.joint_error[0, 0, 2] == pytest.approx(before, abs=0.01)
 
 
-def test_what_has_ended_leaves_nothing_behind():
-    """The state after it, given to a robot whose faults never come, goes on alike to the bit."""
-    later = ALL.replace("@0.1:0.2", "@8:9").replace("@0.14", "@8")
-    env, other, rng = env_with(ALL, ALL), env_with(later, later), np.random.default_rng(0)
-    flail(env, rng, 10)
-    assert env.fault_now[0].count("+") == 5  # the blow is over
-    flail(env, rng)
-    flail(other, rng)
-    other.world.state[:] = env.world.state
-    for _ in range(20):
-        action = rng.normal(size=(2, 12))
-        env.step(action), other.step(action)
-    assert np.array_equal(env.world.bind("qpos"), other.world.bind("qpos"))
-    assert np.array_equal(env._newest_step()[..., :6], other._newest_step()[..., :6])
-
-
-def test_an_interrupted_env_goes_on_alike_in_the_middle_of_faults():
-    whole, again, rng = env_with(ALL, HEALTHY), env_with(ALL, HEALTHY), np.random.default_rng(0)
+def test_an_env_goes_on_to_the_bit_amid_faults_and_when_they_end_nothing_is_left_behind(rng):
+    """Given their state then, a robot whose faults never come goes on alike."""
+    whole, again = env_with(ALL, HEALTHY), env_with(ALL, HEALTHY)
     flail(whole, rng, 8)
+    assert whole.fault_now[0].count("+") == 7  # all of them
     again.load_state_dict(whole.state_dict())
-    go_on_alike(whole, again, rng, 8)
+    go_on_alike(whole, again, rng, 3)
+
+    later = ALL.replace("@0.1:0.2", "@8:9").replace("@0.14", "@8")
+    other = env_with(later, HEALTHY)
+    flail(other, rng)
+    other.world.state[:] = whole.world.state
+    for env in (whole, other):
+        flail(env, np.random.default_rng(1), 20)
+    assert np.array_equal(whole.world.bind("qpos"), other.world.bind("qpos"))
+    assert np.array_equal(whole._newest_step()[..., :6], other._newest_step()[..., :6])
 
 
 def test_what_comes_and_goes_repeats_with_the_seed():
@@ -100,22 +95,21 @@ def test_a_payload_is_felt():
 
 def test_a_blow_gives_its_impulse_once():
     """In free fall: 5 N s on 12.453 kg to the left, all of it in one control step."""
-    env, momentum = env_with("blow:trunk:5@0.04:", HEALTHY), []
+    env, momentum = env_with("blow:trunk:5@0.04:", HEALTHY), ([], [])
     env.world.bind("qpos")[:, 2] = 5.0
     for _ in range(5):
         rest(env)
-        data = [env.world.get_data(i) for i in range(2)]
-        for robot in data:
+        for i in (0, 1):
+            robot = env.world.get_data(i)
             mujoco.mj_subtreeVel(env.model, robot)
-        momentum.append([12.453 * robot.subtree_linvel[1, 1] for robot in data])
-    told = np.array(momentum)
-    assert told[:, 1] == pytest.approx(0, abs=1e-6)
-    assert told[:, 0] == pytest.approx([0, 0, 5, 5, 5], abs=0.02)
+            momentum[i].append(12.453 * robot.subtree_linvel[1, 1])
+    assert momentum[0] == pytest.approx([0, 0, 5, 5, 5], abs=0.02)
+    assert momentum[1] == pytest.approx([0] * 5, abs=1e-6)
 
 
-def test_senses_change_what_is_seen_and_not_what_moves():
+def test_senses_change_what_is_seen_and_not_what_moves(rng):
     faults = "freeze:FR_calf@0.1:", "bias:FL:0.2", "mute:RR", "imu:trunk:0.1", "odometry:trunk:0.5"
-    env, rng = env_with(HEALTHY, *faults), np.random.default_rng(0)
+    env = env_with(HEALTHY, *faults)
     for step in range(20):
         observation, *_ = env.step(np.tile(rng.normal(size=(1, 12)), (6, 1)))
         if step == 5:
@@ -136,8 +130,8 @@ def test_senses_change_what_is_seen_and_not_what_moves():
     assert tilted[0, 18:21] == pytest.approx(told, abs=1e-4)
 
 
-def test_what_freezes_again_after_a_reset_holds_its_own_reading():
-    env, rng = env_of(1, faults=[(1.0, "freeze:FR_calf")]), np.random.default_rng(0)
+def test_what_freezes_again_after_a_reset_holds_its_own_reading(rng):
+    env = env_of(1, faults=[(1.0, "freeze:FR_calf")])
     readings = []
     for _ in range(2):  # poses at the start vary
         readings.append(env.reset().legs[0, 0, -1, 2])
@@ -145,12 +139,3 @@ def test_what_freezes_again_after_a_reset_holds_its_own_reading():
         for _ in range(5):
             assert flail(env, rng)[0].legs[0, 0, -1, 2] == readings[-1]
     assert readings[0] != readings[1]
-
-
-def test_critics_are_told_while_it_lasts():
-    env = env_with("payload:trunk:2@0.1:0.2", "bias:FL:0.2", extras=("privileged",))
-    rng = np.random.default_rng(0)
-    told = [flail(env, rng)[0].privileged[:, -2:].tolist() for _ in range(12)]
-    bias = pytest.approx([0.2, 0])
-    assert [one[1] for one in told] == [bias] * 12
-    assert [one[0] for one in told] == [[0, 0]] * 5 + [[0, 2]] * 5 + [[0, 0]] * 2

@@ -29,8 +29,7 @@ def test_commands_run(command, tmp_path):
         tests = re.findall(r"^def (test_\w+)", (ROOT / file).read_text(), re.MULTILINE)
         assert any(not choice or choice[1] in name for name in tests)
         return
-    command = [sys.executable, *words]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+    done = subprocess.run([sys.executable, *words], cwd=ROOT, capture_output=True, text=True)
     if "cannot draw" in done.stderr:
         pytest.skip(done.stderr)
     assert done.returncode == 0, done.stderr

@@ -24,12 +24,14 @@ def test_the_robot_walks_on_with_what_it_was_told(show):
         show.step()
     assert show.data.time == pytest.approx(0.06) and show.data.qpos[2] > 0.2
     assert np.array_equal(show.data.qpos, show.env.world.bind("qpos")[0])
-    for word in ("0.3", "lock:RL_calf"):
-        show.words.put(word)
+
     env = show.env
+    show.words.put("0.3")
+    show.words.put("lock:RL_calf")
     show.step()
     assert show.env is env and show.fault == "lock:RL_calf"  # without a reset
     assert env.world.bind("eq_active")[0].nonzero()[0].tolist() == [11] and env.command[0, 0] == 0.3
+
     show.hear("offset:0.2+missing:3")  # noise is drawn with an episode: a new one
     assert show.noise == "offset:0.2+missing:3" and show.fault == "lock:RL_calf"
     assert show.env is not env and show.env.scan.missing[0].sum() == 3 * 16
@@ -38,12 +40,10 @@ def test_the_robot_walks_on_with_what_it_was_told(show):
 
 def test_skates_begin_a_new_episode_and_again_does(show):
     flat = watch.Show(show.policy, "a1", HEALTHY, 0.75, 0, None, "clean")
-    env = flat.env
-    flat.hear("skate:FR")
-    assert flat.env is not env and flat.fault == "skate:FR" and flat.data.qpos.size == 20
-    env = flat.env
-    flat.hear("again")
-    assert flat.env is not env and flat.fault == "skate:FR"
+    for word in ("skate:FR", "again"):
+        env = flat.env
+        flat.hear(word)
+        assert flat.env is not env and flat.fault == "skate:FR" and flat.data.qpos.size == 20
 
 
 def test_a_word_that_cannot_be_read_changes_nothing(show):
@@ -59,10 +59,10 @@ def test_films_are_written_without_a_display(tmp_path, monkeypatch):
     """Or with one that is gone. Where nothing can be drawn, the script must say so in one line."""
     monkeypatch.delenv("MUJOCO_GL", raising=False)
     monkeypatch.setenv("DISPLAY", ":99")
-    words = [sys.executable, ROOT / "evaluate.py", "watch", "--fault", "lock:FL_calf"]
-    words += ["--checkpoints", save_policy(tmp_path / "policy.pt"), "--film", "one.gif"]
-    words += ["--seconds", "0.4"]
-    one = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True)
+    save_policy(tmp_path / "policy.pt")
+    words = "watch --fault lock:FL_calf --checkpoints policy.pt --film one.gif --seconds 0.4"
+    command = [sys.executable, ROOT / "evaluate.py", *words.split()]
+    one = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
     if one.returncode:
         assert "MUJOCO_GL" in one.stderr and one.stderr.count("\n") == 1
         pytest.skip(f"nothing can be drawn here: {one.stderr}")
