@@ -49,6 +49,8 @@ def test_the_scan_turns_with_the_robot_and_a_shift_reads_the_ground_elsewhere():
     assert np.allclose(ahead, ahead[:, :1])
     assert np.allclose(turned[0], np.linspace(-0.55, 0.55, 12))  # and, facing left, to the right
     assert np.allclose(turned, turned[:1])
+    to_the_left = SimpleNamespace(height=lambda x, y: y)
+    assert np.allclose(scan(to_the_left, position, yaw)[1] / 20, ahead)
 
     further, up = np.eye(3)[[0, 2]] * 0.2
     assert np.allclose(scan(RAMP, position, yaw, further)[0] / 20, np.clip(ahead - 0.2, -1, 1))
