@@ -53,7 +53,7 @@ def test_a_robot_that_does_not_fit_together_is_refused_and_a_box_that_was_not_bu
         replace(A1, mounts=A1.mounts[::-1])
     env = env_with(HEALTHY)
     env.pin_faults(["tow:RR"])
-    with pytest.raises(ValueError, match="no RR, box or wheel for tow:RR: make the env with this"):
+    with pytest.raises(ValueError, match="no RR for tow:RR; boxes and wheels"):
         env.reset()
 
 
