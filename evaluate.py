@@ -256,6 +256,9 @@ def main(argv: list[str] | None = None) -> None:
         args.robot, args.seconds = args.robot or robot, args.seconds or seconds
         if args.episodes < 1 or args.threads < 1 or args.seconds < CONTROL_DT:
             parser.error(f"there is at least one episode of {CONTROL_DT} s, and one thread")
+        for option in ("fault", "speed", "stairs", "noise", "film", "public", "port"):
+            if args.experiment != "watch" and getattr(args, option) != parser.get_default(option):
+                parser.error(f"--{option} is an option of watch")
         args.task = task or first_task(args.robot)
         if args.stairs is not None:
             args.task = "terrain"

@@ -17,11 +17,11 @@ import mujoco
 import torch
 from torch import nn
 
-import env
-import noise
 from baselines import ROAM
 from checkpoint import load_policy
 from env import JOINT_SCALE, MAX_ACTION, TRUNK_SCALE, EnvConfig, LocomotionEnv
+from env import __doc__ as ABOUT_INPUTS
+from noise import __doc__ as ABOUT_HEIGHTS
 from ppo import to_tensors
 from robots import CONTROL_DT, PHYSICS_DT
 from rolt import Observation
@@ -39,16 +39,16 @@ class Plain(nn.Module):
         return self.policy(Observation(**fields | dict(zip(self.names, inputs))))
 
 
-def contract(card: dict, world: LocomotionEnv, inputs: dict[str, torch.Tensor]) -> dict:
+def contract(card: dict, env: LocomotionEnv, inputs: dict[str, torch.Tensor]) -> dict:
     """All that who calls the program has to know."""
     keys = "stiffness", "damping", "action_scale", "default_pose", "legs", "joints"
-    about = env.__doc__.partition("What rewards")[0] + noise.__doc__
+    about = ABOUT_INPUTS.partition("What rewards")[0] + ABOUT_HEIGHTS
     return {
         **{key: card[key] for key in ("robot", "task", "policy", "seed", "steps")},
-        **{key: getattr(world.robot, key) for key in keys},
+        **{key: getattr(env.robot, key) for key in keys},
         "control_dt": CONTROL_DT, "physics_dt": PHYSICS_DT, "max_action": MAX_ACTION,
         "joint_scale": JOINT_SCALE.ravel().tolist(), "trunk_scale": TRUNK_SCALE.tolist(),
-        "joint_sign": world._joint_sign.tolist(), "trunk_sign": world._trunk_sign.tolist(),
+        "joint_sign": env._joint_sign.tolist(), "trunk_sign": env._trunk_sign.tolist(),
         "inputs": {name: ["robots", *x.shape[1:]] for name, x in inputs.items()},
         "leg_frames": "joint_sign times angles and velocities, trunk_sign times the last twelve; "
         "at the start all steps of the history are the first",
@@ -63,8 +63,8 @@ def export(path: Path, out: Path) -> None:
     if isinstance(policy, ROAM):
         raise ValueError("ROAM draws its behaviour at random, which no program can repeat")
     config = EnvConfig(leg_frames=policy.leg_frames)
-    world = LocomotionEnv(card["robot"], 3, num_threads=1, config=config, extras=policy.extras)
-    observation = to_tensors(world.reset(), "cpu")
+    env = LocomotionEnv(card["robot"], 3, num_threads=1, config=config, extras=policy.extras)
+    observation = to_tensors(env.reset(), "cpu")
     inputs = {x: getattr(observation, x) for x in ("legs", "action", *policy.extras)}
 
     plain = Plain(policy, [*inputs]).eval()
@@ -73,8 +73,8 @@ def export(path: Path, out: Path) -> None:
     program = torch.export.export(plain, tuple(inputs.values()), dynamic_shapes=shapes)
     out.mkdir(parents=True, exist_ok=True)
     torch.export.save(program, out / "policy.pt2")
-    mujoco.mj_saveModel(world.model, str(out / "robot.mjb"))
-    (out / "policy.json").write_text(json.dumps(contract(card, world, inputs), indent=1))
+    mujoco.mj_saveModel(env.model, str(out / "robot.mjb"))
+    (out / "policy.json").write_text(json.dumps(contract(card, env, inputs), indent=1))
 
     again, states = torch.export.load(out / "policy.pt2").module(), 0
     for _ in range(50):
@@ -83,7 +83,7 @@ def export(path: Path, out: Path) -> None:
         if not torch.equal(answer, action):
             gap = (answer - action).abs().max()
             raise RuntimeError(f"the program's actions differ from the policy's by {gap}")
-        observation, states = to_tensors(world.step(action.numpy())[0], "cpu"), states + len(action)
+        observation, states = to_tensors(env.step(action.numpy())[0], "cpu"), states + len(action)
     print(f"written: {out}/policy.pt2, policy.json, robot.mjb; equal to the bit in {states} states")
 
 

@@ -16,10 +16,10 @@ def total_reward(env, dt: float) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     read of it is in the head of env.py."""
 
     def square(x: np.ndarray) -> np.ndarray:
-        """Its sum over all but the robots."""
+        """(N, ...) -> (N,), the sum of squares."""
         return np.sum(x**2, axis=tuple(range(1, x.ndim)))
 
-    v, w, command = env.linear_velocity, env.angular_velocity, env.command
+    v, w, command = env.linear_velocity, env.angular_velocity, env.command  # (N, 3)
     moving = np.linalg.norm(command[:, :2], axis=1) > MOVING_COMMAND
     terms = {
         # Table I has no square of the error: too slow would pay more than exact

@@ -6,8 +6,8 @@ FR, FL, RR, RL (front or rear; the hexapod's front, middle, hind), their joints 
 
 What a fault (faults.py) changes on one robot is prepared here:
 
-    joint lock      an inactive equality constraint        eq_active
-    motor strength  the gains of its position actuator      actuator_gainprm, _biasprm, _forcerange
+    joint lock      an inactive equality constraint          eq_active
+    motor strength  the gains of its position actuator       actuator_gainprm, _biasprm, _forcerange
     half-lock       a joint's stops                          jnt_range
     box to tow      a box on a tether, slack without end     tendon_range      only if asked for
     skate           a foot that is a wheel, its brake on     dof_frictionloss  only if asked for

@@ -226,6 +226,7 @@ def test_all_shipped_seeds_are_put_together(tmp_path, monkeypatch):
     (evaluate, "stiffness --checkpoints misfit.pt", "does not fit"),
     (evaluate, "stiffness --methods mlp --checkpoints good.pt", "not allowed"),
     (evaluate, "stiffness --checkpoints good.pt ./good.pt same.pt", "the same"),
+    (evaluate, "stiffness --stairs 0", "--stairs is an option of watch"),
     (evaluate, "watch --checkpoints good.pt --film walk.mp4", "is a .gif"),
     (evaluate, "watch --checkpoints good.pt --film a.gif --fault melt:FR", "lock:FR_calf"),
     (export, "roam.pt exported", "ROAM draws its behaviour"),
